@@ -111,7 +111,7 @@ def _object(schemas: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
 
 def problems() -> str:
     """The types of problems by status."""
-    from serve.api import problems as module
+    from serve import problems as module
 
     kinds = sorted((k.status, k.name, k.title) for k in module.PROBLEM_TYPES)
     rows = ["| status | type | |", "|---|---|---|"]

@@ -3,7 +3,7 @@ other paths."""
 
 import os
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from functools import partial
@@ -15,29 +15,15 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from mtlnet.inference.engine import Engine
-from serve.api import kserve, problems, schemas
-from serve.api.console import DOCS_PATH, add_console
-from serve.api.features import (
-    FeaturesEndpoint,
-    FeaturesRequest,
-    FrameHandler,
-    RequestFactory,
-    client_address,
-)
-from serve.api.hosts import HostCheck
-from serve.api.http_io import (
-    Receive,
-    Reply,
-    Scope,
-    Send,
-    problem_reply,
-    send_reply,
-    without_body,
-)
+from serve import problems
+from serve.api import kserve, schemas
+from serve.api.access import PROBES, Access
+from serve.api.console import add_console
+from serve.api.features import FeaturesRequest, FrameHandler
+from serve.api.features_asgi import FeaturesEndpoint
 from serve.api.problem_handlers import install_problem_handlers
-from serve.api.problems import Problem
-from serve.api.request_options import Headers, check_token, request_id_of
 from serve.api.stream import Stream
+from serve.asgi import App, Receive, Scope, Send, send_reply, without_body
 from serve.cameras import Cameras
 from serve.config import Limits
 from serve.observability.logs import RefusalLog
@@ -47,15 +33,14 @@ from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.rate_limit import RateLimiter
 from serve.scheduling.streams import StreamTable
 from serve.scheduling.warmup import warm_up
-from serve.workers.shared_memory import SharedMemory, create_shared_memory
+from serve.shared_memory import SharedMemory, create_shared_memory
 from trackfeatures.camera import stored
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
 
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
+    from serve.observability.tracing import RequestTracer
 
-PROBES = {"/healthz", "/readyz", *kserve.PROBES}  # load balancers need no token for these
 NO_CAMERAS: Cameras = {}
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
@@ -89,23 +74,25 @@ class Service:
         )
         self.metrics = Metrics(self.shared, block)
         self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
-        refusals, log_answers = RefusalLog(workers), self.limits.log_answers
-        parts = (self.frame_queue, self.metrics, self.bodies, refusals, log_answers, cameras)
-        self.frames = FrameHandler(*parts)
-        self._make_request: RequestFactory = FeaturesRequest
-        if tracer is not None:
-            self.frames, self._make_request = _traced(tracer, parts)
-        self.features = FeaturesEndpoint(self.frames, self._make_request)
+        self.frames = FrameHandler(
+            self.frame_queue,
+            self.metrics,
+            self.bodies,
+            RefusalLog(workers),
+            self.limits.log_answers,
+            cameras,
+            None if tracer is None else _request_tracer(tracer),
+        )
+        self.make_request = partial(FeaturesRequest, self.frames)
+        self.features = FeaturesEndpoint(self.frames)
         self.rate_limiter = RateLimiter(self.shared.clients(), self.limits.rate)
-        self._hosts = HostCheck(self.limits)
-        self._token = self.limits.token
-        self._stream: App = Stream(self.frames, self.rate_limiter)
+        self.access = Access(self.limits, self.rate_limiter, self.frames.count_refusal)
         self.framework = _framework(self)
         self._framework_app: App = self.framework
-        if tracer is not None:
-            self._stream, self._framework_app = _traced_apps(
-                tracer, self._stream, self._framework_app
-            )
+        self._stream: App = Stream(self.frames, self.rate_limiter)
+        if self.frames.tracer is not None:
+            self._framework_app = self.frames.tracer.traced(self.framework, kserve.INFER_PATHS)
+            self._stream = self.frames.tracer.traced(self._stream, kserve.INFER_PATHS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -114,7 +101,7 @@ class Service:
         protocol = "http" if scope["type"] == "http" else "websocket.http"
         if scope.get("method") == "HEAD":
             scope, send = {**scope, "method": "GET"}, without_body(send)
-        refusal = self._authorize_scope(scope)
+        refusal = self.access.scope_refusal(scope)
         if refusal is not None:
             await send_reply(send, refusal, protocol)
             return
@@ -125,62 +112,11 @@ class Service:
         else:
             await self._framework_app(scope, receive, send)
 
-    def open(
-        self, headers: Headers, client: str, send: Callable[[Reply], None]
-    ) -> FeaturesRequest | None:
-        """Begin a POST /features without ASGI. Returns None after a refusal, which is then sent.
 
-        Precondition: no header name occurs twice in the request.
-        """
-        refusal = self._authorize(headers, client) or self.frames.refuse_early(headers, client)
-        if refusal is not None:
-            send(refusal)
-            return None
-        request = self._make_request(self.frames, client, send)
-        return request if request.open(headers) else None
+def _request_tracer(tracer: "Tracer") -> "RequestTracer":
+    from serve.observability.tracing import RequestTracer  # needs the extra `telemetry`
 
-    def _authorize(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a client that exceeds its rate, has a wrong Host or Origin, or lacks the
-        token; None for an accepted client."""
-        try:
-            self.rate_limiter.check(client)
-            self._hosts.check(headers)
-            check_token(headers, self._token)
-        except Problem as problem:
-            return self._refuse(problem, headers, client)
-        return None
-
-    def _authorize_scope(self, scope: Scope) -> Reply | None:
-        """Like `_authorize`, for any path and for headers in which a name can occur twice."""
-        path, headers, client = scope["path"], dict(scope["headers"]), client_address(scope)
-        try:
-            public = _is_public(path)
-            self.rate_limiter.check(client, public=public)
-            self._hosts.check_single([name for name, _ in scope["headers"]])
-            version = scope.get("http_version", "1.1")
-            self._hosts.check(headers, probe=path in PROBES, version=version)
-            if not public:
-                check_token(headers, self._token)
-        except Problem as problem:
-            return self._refuse(problem, headers, client, path)
-        return None
-
-    def _refuse(self, problem: Problem, headers: Headers, client: str, path: str = "") -> Reply:
-        self.frames.refusals.log(request_id_of(headers), client, problem)
-        self.metrics.count_refusal(problem.type, self.frame_queue.waiting)
-        return problem_reply(problem, path=path)
-
-
-def _traced(tracer: "Tracer", parts: tuple[Any, ...]) -> tuple[FrameHandler, RequestFactory]:
-    from serve.observability.tracing import TracedFeaturesRequest, TracedFrameHandler
-
-    return TracedFrameHandler(tracer, *parts), partial(TracedFeaturesRequest, tracer)
-
-
-def _traced_apps(tracer: "Tracer", *apps: App) -> list[App]:
-    from serve.observability.tracing import TracedApp
-
-    return [TracedApp(tracer, app) for app in apps]
+    return RequestTracer(tracer)
 
 
 def _cores() -> int:
@@ -188,11 +124,6 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _is_public(path: str) -> bool:
-    """Whether a path needs no token: probes, docs, and the console, which asks for the token."""
-    return path in PROBES or path in ("/", DOCS_PATH) or path.startswith("/console/")
 
 
 def _framework(service: Service) -> FastAPI:

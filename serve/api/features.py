@@ -1,30 +1,29 @@
 """POST /features, from the headers of a request to its reply; `serve.api.schemas` has the JSON.
 
-`serve.server.fast_path` creates a `FeaturesRequest` for each request. `FeaturesEndpoint` does the
-same as an ASGI application, for other servers. All endpoints for images use `FrameHandler`.
+`serve.server.fast_path` creates a `FeaturesRequest` for each request, and `serve.api.features_asgi`
+does so under ASGI. All endpoints for images use `FrameHandler`.
 """
 
 import asyncio
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode_whole, read_header
-from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.http_io import (
-    ClientDisconnectedError,
-    Receive,
-    Reply,
-    Scope,
-    Send,
-    check_body_size,
-    problem_reply,
-    read_body,
-    send_reply,
+import numpy as np
+from numpy.typing import NDArray
+
+from mtlnet.inference.image_decoding.crop import crop_box
+from mtlnet.inference.image_decoding.decode import (
+    LATE_CHECK_BYTES,
+    crop_and_resize,
+    decode_whole,
+    read_header,
 )
-from serve.api.problems import INVALID_REQUEST, Problem, as_problem, internal_error
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.inference.rectification import Rectification
 from serve.api.request_options import (
     CAMERA,
     FIELD_OF_VIEW,
@@ -32,22 +31,57 @@ from serve.api.request_options import (
     RequestOptions,
     check_image_headers,
     parse_options,
-    read_options,
     request_id_of,
 )
-from serve.cameras import Cameras, Sight
+from serve.cameras import Cameras
 from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
+from serve.problems import INVALID_REQUEST, Problem, as_problem, internal_error
+from serve.replies import Reply, problem_reply
 from serve.scheduling.body_budget import BodyBudget, BodyShare
-from serve.scheduling.fair_queue import Frame, FrameResult, PixelReader, ResultCallback
+from serve.scheduling.frame import Frame, FrameResult, PixelReader, ResultCallback
 from serve.scheduling.frame_queue import FrameQueue
 from serve.scheduling.streams import stream_key
+from trackfeatures.camera import CameraParameters
+
+if TYPE_CHECKING:
+    from opentelemetry.trace import Span
+
+    from serve.observability.tracing import RequestTracer
 
 # Limits of pixels, estimated decoding time in ms and JPEG bytes for decoding on the event loop. The
 # estimate depends on a JPEG's pixels only, so its bytes need a limit.
 SMALL_PIXELS, SMALL_MS, SMALL_BYTES = 640 * 480, 12.0, LATE_CHECK_BYTES
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """The camera of an image: `camera`, if given; else the model's camera, with the vertical field
+    of view `fov_y_deg` if given."""
+
+    fov_y_deg: float | None = None
+    camera: CameraParameters | None = None
+
+    def check(self, width: int, height: int, view: CameraParameters) -> None:
+        """Raise ImageError if an image of this size in px does not cover what `view` shows."""
+        if self.camera is None:
+            crop_box(width, height, view, self.fov_y_deg)
+        else:
+            Rectification(self.camera, view).check(width, height)
+
+    def through(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
+        """`image` (H, W, 3) as seen by the model's camera `view`. Raises ImageError."""
+        if self.camera is None:
+            return crop_and_resize(image, view, self.fov_y_deg)
+        return Rectification(self.camera, view).image(image)
+
+    def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
+        """[left, top, width, height] in px of the part that the model sees. None if the whole image
+        is used or the image is warped."""
+        box = None if self.camera else crop_box(width, height, view, self.fov_y_deg)
+        return None if box is None else [box.left, box.top, box.width, box.height]
 
 
 class FrameHandler:
@@ -61,9 +95,11 @@ class FrameHandler:
         refusals: RefusalLog,
         log_answers: bool,
         cameras: Cameras,
+        tracer: "RequestTracer | None" = None,
     ) -> None:
         self.queue = queue
         self.cameras = cameras
+        self.tracer = tracer
         self._bodies = bodies
         self._metrics = metrics
         self.refusals = refusals
@@ -81,8 +117,6 @@ class FrameHandler:
         Returns `crop_px` of the answer. Raises Problem, ImageError.
         """
         self.queue.check_ready()
-        if options.stream is None:
-            self.queue.check_capacity(client)  # an overloaded worker does not parse images
         camera, sight = self.queue.loaded.engine.card.camera, self.sight(options)
         header = read_header(body)
         sight.check(header.width, header.height, camera)
@@ -112,21 +146,6 @@ class FrameHandler:
             known = ", ".join(self.cameras) or "none (serve --camera NAME=FILE gives it one)"
             raise Problem(INVALID_REQUEST, f"{CAMERA} is {name[:80]!r}; the service knows {known}")
         return Sight(None, self.cameras[name])
-
-    def refuse_early(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a frame for which the queue has no room, else None.
-
-        It needs only the headers, so that an overloaded worker does little work. A frame of a
-        stream is not refused here, since it can replace a queued frame.
-        """
-        if b"x-stream-id" in headers:
-            return None
-        problem = self.queue.refusal(client)
-        if problem is None:
-            return None
-        request_id = request_id_of(headers)
-        self._count_refusal(problem, request_id, client)
-        return problem_reply(problem, (b"x-request-id", request_id.encode()))
 
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
@@ -160,21 +179,39 @@ class FrameHandler:
         self.record_answer(options, client, result)
         return result
 
-    def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
-        """Count an answer, and log it if `log_answers` is set."""
+    def record_answer(
+        self,
+        options: RequestOptions,
+        client: str,
+        result: FrameResult,
+        span: "Span | None" = None,
+    ) -> None:
+        """Count an answer, and log it if `log_answers` is set. `span` is that of its request."""
         total_s = (time.monotonic_ns() - options.stamp_ns) / 1e9
         self._metrics.count_answer(result, total_s, self.queue.waiting)
         if self._log_answers:
             log_answer(options.request_id, client, 1e3 * total_s)
+        if self.tracer is not None:
+            about = (options.stamp_ns, options.request_id, options.frame_id, client)
+            self.tracer.record_answer(span, *about, result)
 
-    def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
+    def record_refusal(
+        self,
+        error: Problem | ImageError,
+        request_id: str,
+        client: str,
+        span: "Span | None" = None,
+    ) -> Problem:
         """Count and log an error; returns the problem for the reply."""
         forget_frames(error)
         problem = as_problem(error)
-        self._count_refusal(problem, request_id, client)
+        self.count_refusal(problem, request_id, client)
+        if self.tracer is not None:
+            self.tracer.record_problem(span, problem, request_id)
         return problem
 
-    def _count_refusal(self, problem: Problem, request_id: str, client: str) -> None:
+    def count_refusal(self, problem: Problem, request_id: str, client: str) -> None:
+        """Count a refused request, and log it."""
         self.refusals.log(request_id, client, problem)
         self._metrics.count_refusal(problem.type, self.queue.waiting)
 
@@ -195,18 +232,20 @@ class FeaturesRequest:
     call `abandon`; then `send` is not called.
     """
 
-    __slots__ = ("_client", "_crop", "_frames", "_options", "_request_id", "_send", "_share")
+    __slots__ = (
+        *("_client", "_crop", "_frames", "_options", "_request_id", "_send", "_share", "_span"),
+    )
 
     def __init__(self, frames: FrameHandler, client: str, send: Callable[[Reply], None]) -> None:
         self._frames = frames
         self._client = client
         self._send = send
         self._share = frames.share()
+        self._span: Span | None = None
 
-    def grow(self, size: int) -> None:
+    def receive(self, size: int) -> None:
         """Reserve memory for `size` more bytes of the body. Raises Problem."""
-        check_body_size(self._share.size + size)
-        self._share.grow(size)
+        self._share.receive(size)
 
     def abandon(self) -> None:
         """Release the request's memory because the client has disconnected."""
@@ -216,10 +255,15 @@ class FeaturesRequest:
         """Check the headers; returns False after a refusal, when the body is not needed."""
         stamp_ns = time.monotonic_ns()
         self._request_id = request_id_of(headers)
+        frames = self._frames
+        if frames.tracer is not None:
+            self._span = frames.tracer.begin("/features", headers.items(), self._client)
+        # An overloaded worker must not read bodies. A frame of a stream can replace a queued one.
+        full = None if b"x-stream-id" in headers else frames.queue.refusal(self._client)
+        if full is not None:
+            self.refuse(full)
+            return False
         try:
-            if b"x-stream-id" not in headers:
-                # An overloaded worker must not read bodies.
-                self._frames.queue.check_capacity(self._client)
             self._options = parse_options(headers, stamp_ns, self._request_id)
             check_image_headers(headers)
         except Problem as problem:
@@ -240,8 +284,9 @@ class FeaturesRequest:
     def refuse(self, error: Problem | ImageError) -> None:
         """Reply with the problem of an error."""
         self._share.close()
-        problem = self._frames.record_refusal(error, self._request_id, self._client)
-        self._send(problem_reply(problem, (b"x-request-id", self._request_id.encode())))
+        who = (self._request_id, self._client)
+        problem = self._frames.record_refusal(error, *who, self._span)
+        self._finish(problem_reply(problem, (b"x-request-id", self._request_id.encode())))
 
     def _on_result(self, result: FrameResult | Exception) -> None:
         if isinstance(result, Problem | ImageError):
@@ -256,50 +301,19 @@ class FeaturesRequest:
             self.refuse(internal_error())
         else:
             self._share.close()
-            self._send(reply)
+            self._finish(reply)
+
+    def _finish(self, reply: Reply) -> None:
+        if self._span is not None and self._frames.tracer is not None:
+            self._frames.tracer.end(self._span, reply.status)
+        self._send(reply)
 
     def _reply(self, result: FrameResult) -> Reply:
         options = self._options
-        self._frames.record_answer(options, self._client, result)
+        self._frames.record_answer(options, self._client, result, self._span)
         headers = [(b"x-request-id", self._request_id.encode()), options.format.header]
         content = response_content(options, result, self._crop)
         return Reply(200, headers, options.format.encode(content))
-
-
-RequestFactory = Callable[[FrameHandler, str, Callable[[Reply], None]], FeaturesRequest]
-"""Makes a request from its handler, the client's address and the function that sends the reply."""
-
-
-class FeaturesEndpoint:
-    """POST /features as an ASGI application."""
-
-    def __init__(
-        self, frames: FrameHandler, make_request: RequestFactory = FeaturesRequest
-    ) -> None:
-        self._frames = frames
-        self._make_request = make_request
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        reply: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        client = client_address(scope)
-        try:
-            headers = read_options(scope)
-        except Problem as problem:
-            request_id = request_id_of(dict(scope["headers"]))
-            problem = self._frames.record_refusal(problem, request_id, client)
-            sent = (b"x-request-id", request_id.encode())
-            await send_reply(send, problem_reply(problem, sent))
-            return
-        request = self._make_request(self._frames, client, partial(resolve, reply))
-        if request.open(headers):
-            try:
-                request.submit(await read_body(receive, request.grow))
-            except ClientDisconnectedError:
-                request.abandon()
-                return
-            except Problem as problem:
-                request.refuse(problem)
-        await send_reply(send, await reply)
 
 
 def resolve(future: "asyncio.Future[Any]", result: Any) -> None:
@@ -324,12 +338,6 @@ def _frame(
     return Frame(
         read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms, sight.camera
     )
-
-
-def client_address(scope: Scope) -> str:
-    """The client's address; empty if it is unknown."""
-    client = scope.get("client")
-    return client[0] if client else ""
 
 
 def response_content(

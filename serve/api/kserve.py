@@ -26,8 +26,7 @@ from mtlnet.inference.image_decoding.decode import check_size, decode_whole, rea
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import Prediction
 from mtlnet.inference.uncertainty import FEATURES
-from serve.api.features import FrameHandler, client_address
-from serve.api.http_io import ClientDisconnectedError, read_body
+from serve.api.features import FrameHandler, Sight
 from serve.api.kserve_tensors import (
     PAUSE_S,
     WINDOW_BYTES,
@@ -40,7 +39,6 @@ from serve.api.kserve_tensors import (
     read_json_length,
     take_options,
 )
-from serve.api.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error, with_error
 from serve.api.request_options import (
     KSERVE_FORMATS,
     check_body_headers,
@@ -50,14 +48,17 @@ from serve.api.request_options import (
     request_id_of,
 )
 from serve.api.schemas import REFUSALS, image_parameters, problem_responses
-from serve.cameras import Sight
-from serve.scheduling.fair_queue import FairLock, PixelReader
+from serve.asgi import ClientDisconnectedError, client_address, read_body
+from serve.problems import MEDIA_TYPE, NOT_READY, Problem, internal_error, with_error
+from serve.scheduling.fair_lock import FairLock
+from serve.scheduling.frame import PixelReader
 
 NAME, VERSION = "track", "1"
 HEADER = "Inference-Header-Content-Length"
 MODEL = f"/v2/models/{NAME}"
 MODELS = (MODEL, f"{MODEL}/versions/{VERSION}")
 PROBES = {"/v2/health/live", "/v2/health/ready", *(f"{model}/ready" for model in MODELS)}
+INFER_PATHS = {f"{model}/infer" for model in MODELS}
 INPUTS = [
     {"name": "image", "datatype": "BYTES", "shape": [1, 1]},
     {"name": "pixels", "datatype": "UINT8", "shape": [1, -1, -1, 3]},
@@ -166,11 +167,12 @@ async def _answer(
     check_body_headers(headers)
     frames.queue.check_ready()
     client = client_address(request.scope)
-    if options.stream is None:
-        frames.queue.check_capacity(client)  # an overloaded worker reads and parses nothing
+    full = None if options.stream is not None else frames.queue.refusal(client)
+    if full is not None:
+        raise full  # an overloaded worker reads and parses nothing
     share = frames.share()
     try:
-        body = await read_body(request.receive, share.grow)
+        body = await read_body(request.receive, share.receive)
         length = read_json_length(body, headers.get(HEADER.lower().encode()))
         large = length > WINDOW_BYTES
         async with one_large.held(client) if large else nullcontext():

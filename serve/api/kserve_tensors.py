@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from serve.api.problems import INVALID_REQUEST, Problem
 from serve.api.request_options import OPTIONS, check_names, parse_json_object
+from serve.problems import INVALID_REQUEST, Problem
 
 MAX_DEPTH = 4
 MAX_VALUES = 1_300_000  # JSON values and lists: 640 x 480 px; each blocks the event loop for 10 ns

@@ -10,7 +10,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.problems import (
+from serve.problems import (
     INVALID_REQUEST,
     MEDIA_TYPE,
     METHOD_NOT_ALLOWED,

@@ -1,5 +1,5 @@
 """Reads and checks the options of a request: ids, stream, deadline, camera, field of view, format
-of the answer (JSON or MessagePack), token, and the headers that describe the body.
+of the answer (JSON or MessagePack), and the headers that describe the body.
 
 All endpoints for images have the same options, as headers or in the query. The Open Inference
 Protocol also accepts them in `parameters`, and /stream in a text message.
@@ -11,22 +11,20 @@ import os
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from functools import lru_cache
-from hmac import compare_digest
 from math import isfinite
 from typing import Any
 from urllib.parse import parse_qsl
 
 import msgspec
 
-from serve.api.problems import (
-    BODY_TOO_LARGE,
+from serve.config import MAX_BODY_BYTES, MAX_DEADLINE_MS, MAX_NAME
+from serve.problems import (
     INVALID_REQUEST,
     NOT_ACCEPTABLE,
-    UNAUTHORIZED,
     UNSUPPORTED_TYPE,
     Problem,
+    body_too_large,
 )
-from serve.config import MAX_BODY_BYTES, MAX_DEADLINE_MS, MAX_NAME
 
 FRAME_ID, REQUEST_ID, STREAM_ID = "X-Frame-Id", "X-Request-Id", "X-Stream-Id"
 DEADLINE, FIELD_OF_VIEW, CAMERA = "X-Deadline-Ms", "X-Camera-Fov-Y", "X-Camera"
@@ -305,17 +303,6 @@ def _parse_number(sent: bytes | str, header: str, low: float, high: float) -> fl
     return value
 
 
-def check_token(headers: Headers, token: str | None) -> None:
-    """Raise Problem if the request lacks the service's token."""
-    if token is None:
-        return
-    scheme, _, sent = headers.get(b"authorization", b"").partition(b" ")
-    if scheme.lower() != b"bearer" or not compare_digest(sent.strip(), token.encode()):
-        raise Problem(
-            UNAUTHORIZED, "send the service's token with the header Authorization: Bearer TOKEN"
-        )
-
-
 def check_image_headers(headers: Headers) -> None:
     """Raise Problem if the headers show that the body is not a usable image."""
     sent = headers.get(b"content-type", b"")
@@ -343,12 +330,3 @@ def check_body_headers(headers: Headers) -> None:
     length = headers.get(b"content-length", b"")
     if length.isdigit() and int(length[:20]) > MAX_BODY_BYTES:
         raise body_too_large(f"{int(length[:20])} bytes")
-
-
-def body_too_large(seen: str) -> Problem:
-    """The problem of a body that is too large; `seen` describes its size."""
-    return Problem(
-        BODY_TOO_LARGE,
-        f"the body has {seen}; the limit is {MAX_BODY_BYTES}: send a smaller image or "
-        "compress it more",
-    )

@@ -7,8 +7,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel, Field, JsonValue
 
-from serve.api import problems
-from serve.api.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemType
+from serve import problems
 from serve.api.request_options import (
     CAMERA,
     DEADLINE,
@@ -23,6 +22,7 @@ from serve.api.request_options import (
     STREAM_ID,
 )
 from serve.config import MAX_DEADLINE_MS, MAX_NAME
+from serve.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemType
 
 PROBLEM_URIS: list[JsonValue] = [*(found.uri for found in PROBLEM_TYPES), "about:blank"]
 

@@ -16,14 +16,7 @@ from dataclasses import dataclass, replace
 from http import HTTPStatus
 
 from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.features import FrameHandler, client_address
-from serve.api.http_io import Message, Receive, Scope, Send, problem_reply, send_reply
-from serve.api.problems import (
-    INVALID_REQUEST,
-    NOT_FOUND,
-    Problem,
-    internal_error,
-)
+from serve.api.features import FrameHandler
 from serve.api.request_options import (
     CAMERA,
     FRAME_ID,
@@ -43,6 +36,14 @@ from serve.api.request_options import (
     read_options,
     request_id_of,
 )
+from serve.asgi import Message, Receive, Scope, Send, client_address, send_reply
+from serve.problems import (
+    INVALID_REQUEST,
+    NOT_FOUND,
+    Problem,
+    internal_error,
+)
+from serve.replies import problem_reply
 from serve.scheduling.rate_limit import RateLimiter
 
 PATH = "/stream"

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from serve.config import network_of
 
 if TYPE_CHECKING:
-    from serve.api.problems import Problem  # loads FastAPI, which the supervisor does not need
+    from serve.problems import Problem  # loads FastAPI, which the supervisor does not need
 
 REFUSALS_PER_S = 10.0
 INTERVAL_S = 1.0  # least time between two refusals of one client, and between two equal errors

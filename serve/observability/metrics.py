@@ -8,9 +8,9 @@ Source: Prometheus text exposition format 0.0.4.
 from bisect import bisect_left
 from collections.abc import Iterator
 
-from serve.api.problems import PROBLEM_TYPES, ProblemType
-from serve.scheduling.fair_queue import FrameResult
-from serve.workers.shared_memory import (
+from serve.problems import PROBLEM_TYPES, ProblemType
+from serve.scheduling.frame import FrameResult
+from serve.shared_memory import (
     CLOSED_COUNTS,
     CONNECTIONS,
     FRAME_COUNTS,

@@ -9,157 +9,105 @@ traces are enabled (`serve.observability.telemetry`).
 """
 
 import time
-from collections.abc import Awaitable, Callable, Iterable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Collection, Iterable
 
 from opentelemetry import context, propagate, trace
 from opentelemetry.trace import Span, SpanKind, Status, StatusCode, Tracer
 
-from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.features import FeaturesRequest, FrameHandler, client_address
-from serve.api.http_io import Message, Receive, Reply, Scope, Send
-from serve.api.kserve import MODELS
-from serve.api.problems import Problem
-from serve.api.request_options import Headers, RequestOptions
-from serve.scheduling.fair_queue import FrameResult
-
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
-INFER_PATHS = {f"{model}/infer" for model in MODELS}
+from serve.asgi import App, Message, Receive, Scope, Send, client_address
+from serve.problems import Problem
+from serve.scheduling.frame import FrameResult
 
 
-class TracedFrameHandler(FrameHandler):
-    """A FrameHandler with a span `perceive` for each frame, which contains the spans `queue`,
-    `decode` and `forward`."""
+class RequestTracer:
+    """Records the spans of requests and frames. Where `span` is None, the current span is used."""
 
-    def __init__(self, tracer: Tracer, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(self, tracer: Tracer) -> None:
         self._tracer = tracer
 
-    def refuse_early(self, headers: Headers, client: str) -> Reply | None:
-        """Returns None, so that `TracedFeaturesRequest` refuses the frame, in a span."""
-        return None
+    def begin(self, path: str, headers: Iterable[tuple[bytes, bytes]], client: str) -> Span:
+        """Begin the span of a POST request."""
+        attributes = {"http.request.method": "POST", "url.path": path, "client.address": client}
+        parent = _parent_context(headers)
+        return self._tracer.start_span(f"POST {path}", parent, SpanKind.SERVER, attributes)
 
-    def record_answer(self, options: RequestOptions, client: str, result: FrameResult) -> None:
-        super().record_answer(options, client, result)
-        start_ns = options.stamp_ns + time.time_ns() - time.monotonic_ns()  # since 1970
-        attributes = {"driverview.request_id": options.request_id, "client.address": client}
+    def end(self, span: Span, status: int) -> None:
+        """End the span of a request that was answered with this HTTP status."""
+        _set_status(span, status)
+        span.end()
+
+    def record_answer(
+        self,
+        span: Span | None,
+        stamp_ns: int,
+        request_id: str,
+        frame_id: str | None,
+        client: str,
+        result: FrameResult,
+    ) -> None:
+        """Record the span `perceive` of a frame, which contains `queue`, `decode` and `forward`.
+
+        `stamp_ns` is the start of its request on the monotonic clock.
+        """
+        start_ns = stamp_ns + time.time_ns() - time.monotonic_ns()  # since 1970
+        attributes = {"driverview.request_id": request_id, "client.address": client}
         attributes |= {f"driverview.{name}": value for name, value in result.provenance.items()}
-        if options.frame_id is not None:
-            attributes["driverview.frame_id"] = options.frame_id
-        span = self._tracer.start_span("perceive", start_time=start_ns, attributes=attributes)
-        context_of_span, at = trace.set_span_in_context(span), start_ns
+        if frame_id is not None:
+            attributes["driverview.frame_id"] = frame_id
+        parent = None if span is None else trace.set_span_in_context(span)
+        frame = self._tracer.start_span(
+            "perceive", parent, start_time=start_ns, attributes=attributes
+        )
+        context_of_frame, at = trace.set_span_in_context(frame), start_ns
         for name, time_ms in (
             ("queue", result.queue_ms),
             ("decode", result.decode_ms),
             ("forward", result.forward_ms),
         ):
             end = at + round(1e6 * time_ms)
-            self._tracer.start_span(name, context_of_span, start_time=at).end(end)
+            self._tracer.start_span(name, context_of_frame, start_time=at).end(end)
             at = end
-        span.end()
+        frame.end()
 
-    def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
-        problem = super().record_refusal(error, request_id, client)
-        span = trace.get_current_span()
-        if span.is_recording():
-            _set_problem(span, problem, request_id)
+    def record_problem(self, span: Span | None, problem: Problem, request_id: str) -> None:
+        """Record why a request was refused: in its span, or in a span `refuse` if it has none."""
+        found = trace.get_current_span() if span is None else span
+        if found.is_recording():
+            _set_problem(found, problem, request_id)
         else:  # a frame of a WebSocket has no request span
             with self._tracer.start_as_current_span("refuse") as own:
                 _set_problem(own, problem, request_id)
-        return problem
 
+    def traced(self, app: App, paths: Collection[str]) -> App:
+        """`app` with a span for each POST to one of `paths`. What it does for a WebSocket continues
+        the trace of the handshake."""
 
-class TracedFeaturesRequest(FeaturesRequest):
-    """A POST /features with a span from the headers to the reply."""
+        async def call(scope: Scope, receive: Receive, send: Send) -> None:
+            if scope["type"] == "websocket":
+                token = context.attach(_parent_context(scope["headers"]))  # for each frame's task
+                try:
+                    await app(scope, receive, send)
+                finally:
+                    context.detach(token)
+                return
+            if scope["type"] != "http" or scope["method"] != "POST" or scope["path"] not in paths:
+                await app(scope, receive, send)
+                return
+            started = self.begin(scope["path"], scope["headers"], client_address(scope))
+            with trace.use_span(started, end_on_exit=True) as span:
 
-    __slots__ = ("_context", "_send_reply", "_span", "_tracer")
+                async def send_and_record(message: Message) -> None:
+                    if message["type"] == "http.response.start":
+                        _set_status(span, message["status"])
+                    await send(message)
 
-    def __init__(
-        self, tracer: Tracer, frames: FrameHandler, client: str, send: Callable[[Reply], None]
-    ) -> None:
-        super().__init__(frames, client, self._end)
-        self._tracer = tracer
-        self._send_reply = send
+                await app(scope, receive, send_and_record)
 
-    def open(self, headers: Headers) -> bool:
-        parent = _parent_context(headers.items())
-        attributes = _request_attributes("/features", self._client)
-        self._span = self._tracer.start_span("POST /features", parent, SpanKind.SERVER, attributes)
-        self._context = trace.set_span_in_context(self._span, parent)
-        with _attached(self._context):
-            return super().open(headers)
-
-    def submit(self, body: bytes) -> None:
-        with _attached(self._context):
-            super().submit(body)
-
-    def refuse(self, error: Problem | ImageError) -> None:
-        with _attached(self._context):
-            super().refuse(error)
-
-    def _on_result(self, result: FrameResult | Exception) -> None:
-        with _attached(self._context):
-            super()._on_result(result)
-
-    def _end(self, reply: Reply) -> None:
-        _set_status(self._span, reply.status)
-        self._span.end()
-        self._send_reply(reply)
-
-
-class TracedApp:
-    """An ASGI application with a span for each inference request (Open Inference Protocol)."""
-
-    def __init__(self, tracer: Tracer, app: App) -> None:
-        self._tracer = tracer
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and _is_infer_request(scope):
-            await self._answer(scope, receive, send)
-        elif scope["type"] == "websocket":
-            with _attached(_parent_context(scope["headers"])):  # for each frame's task
-                await self._app(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
-
-    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        with self._tracer.start_as_current_span(
-            f"POST {scope['path']}",
-            _parent_context(scope["headers"]),
-            SpanKind.SERVER,
-            _request_attributes(scope["path"], client_address(scope)),
-        ) as span:
-
-            async def send_and_record(message: Message) -> None:
-                if message["type"] == "http.response.start":
-                    _set_status(span, message["status"])
-                await send(message)
-
-            await self._app(scope, receive, send_and_record)
-
-
-def _is_infer_request(scope: Scope) -> bool:
-    path: str = scope["path"]
-    return scope["method"] == "POST" and path in INFER_PATHS
-
-
-def _request_attributes(path: str, client: str) -> dict[str, str]:
-    return {"http.request.method": "POST", "url.path": path, "client.address": client}
+        return call
 
 
 def _parent_context(headers: Iterable[tuple[bytes, bytes]]) -> context.Context:
     return propagate.extract({k.decode("latin-1"): v.decode("latin-1") for k, v in headers})
-
-
-@contextmanager
-def _attached(to: context.Context) -> Iterator[None]:
-    token = context.attach(to)
-    try:
-        yield
-    finally:
-        context.detach(token)
 
 
 def _set_status(span: Span, status: int) -> None:

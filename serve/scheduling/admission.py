@@ -9,14 +9,14 @@ while it is decoded. A client is an IPv4 address or an IPv6 /64 network.
 
 from collections.abc import Callable
 
-from serve.api.problems import OVERLOADED, Problem
 from serve.config import network_of
+from serve.problems import OVERLOADED, Problem
+from serve.scheduling.fair_queue import FairQueue
 
 MAX_PENDING_MS = 1000.0  # cost of all unfinished large images of all clients
 MAX_CLIENT_MS = 250.0  # cost of all unfinished large images of a client; one is always allowed
 SHARE = 0.25  # share of the engine's time for a client's large images if others are present
 MAX_BESIDE_MS = 200.0  # cost of one image if others are present: four frames at 20 Hz
-PRESENT_NS = 1_000_000_000  # a client counts as present for this time after each of its frames
 MAX_CLIENTS = 1024  # number of clients whose credit is remembered
 
 Client = str
@@ -25,19 +25,12 @@ Client = str
 class Admission:
     """Admits large images by their estimated decoding time. Use it in the event loop's thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, waiting: FairQueue) -> None:
+        """`waiting` knows whether other clients are present."""
+        self._waiting = waiting
         self._pending_ms = 0.0
         self._client_ms: dict[Client, float] = {}  # cost of unfinished images
         self._credit: dict[Client, tuple[float, int]] = {}  # (remaining ms, at this time in ns)
-        self._newest: tuple[Client, int] = ("", -PRESENT_NS)
-        self._other: tuple[Client, int] = ("", -PRESENT_NS)  # before `_newest`
-
-    def note(self, client: Client, now_ns: int) -> None:
-        """Record that a client has sent a frame of any size."""
-        client = network_of(client)
-        if client != self._newest[0]:
-            self._other = self._newest
-        self._newest = (client, now_ns)
 
     def admit(self, client: Client, cost_ms: float, now_ns: int) -> Callable[[], None]:
         """Admit a large image. Returns a function to call when it is done. Raises Problem."""
@@ -48,7 +41,7 @@ class Admission:
         if self._pending_ms and self._pending_ms + cost_ms > MAX_PENDING_MS:
             raise self._too_much(self._pending_ms, "of all clients")
         credit = self._credit_of(client, now_ns)
-        if self._contended(client, now_ns):
+        if self._waiting.others_present(client, now_ns):
             if cost_ms > MAX_BESIDE_MS:
                 raise Problem(
                     OVERLOADED,
@@ -70,10 +63,6 @@ class Admission:
     def _credit_of(self, client: Client, now_ns: int) -> float:
         left, since_ns = self._credit.get(client, (MAX_CLIENT_MS, now_ns))
         return min(MAX_CLIENT_MS, left + SHARE * (now_ns - since_ns) / 1e6)
-
-    def _contended(self, client: Client, now_ns: int) -> bool:
-        latest = self._other if self._newest[0] == client else self._newest
-        return now_ns - latest[1] < PRESENT_NS
 
     def _done(self, client: Client, cost_ms: float) -> None:
         left = self._client_ms[client] - cost_ms

@@ -1,4 +1,4 @@
-"""Memory budget for request bodies, shared by all requests of all workers.
+"""Limits for request bodies: the size of one, and the memory of all requests of all workers.
 
 Each worker writes its number of bytes into its block of the shared memory. There is no lock, so
 simultaneous requests in different workers can exceed the budget by a body each. If the budget is
@@ -8,8 +8,9 @@ clients that withhold the last bytes of large bodies could block all other clien
 
 from collections.abc import Callable
 
-from serve.api.problems import OVERLOADED, Problem
-from serve.workers.shared_memory import BODY_BYTES, SharedMemory
+from serve.config import MAX_BODY_BYTES
+from serve.problems import OVERLOADED, Problem, body_too_large
+from serve.shared_memory import BODY_BYTES, SharedMemory
 
 SMALL_BYTES = 256 << 10  # slow bodies are ended for a body of up to this size; most images fit
 
@@ -62,6 +63,12 @@ class BodyShare:
     def __init__(self, budget: BodyBudget) -> None:
         self._budget = budget
         self.size = 0
+
+    def receive(self, size: int) -> None:
+        """Reserve `size` more bytes of a body. Raises Problem, also if the body is too large."""
+        if self.size + size > MAX_BODY_BYTES:
+            raise body_too_large(f"more than {MAX_BODY_BYTES} bytes")
+        self.grow(size)
 
     def grow(self, size: int) -> None:
         """Reserve `size` more bytes. Raises Problem."""

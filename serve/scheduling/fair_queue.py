@@ -1,57 +1,16 @@
-"""A queue of frames, and a lock, in which clients take turns.
+"""A queue of frames in which clients take turns.
 
 If the queue is full, the client with the most frames in it loses one to a client with fewer frames.
 A client is an IPv4 address or an IPv6 /64 network.
 """
 
-import asyncio
-from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from collections import Counter
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mtlnet.inference.prediction import Prediction
 from serve.config import network_of
-from trackfeatures.camera import CameraParameters
+from serve.scheduling.frame import Frame, ResultCallback
 
 MAX_CLIENTS = 1024  # number of clients whose last turn is remembered
-
-PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
-"""Returns the pixels (height, width, 3) uint8 RGB in the view of the model's camera."""
-ResultCallback = Callable[["FrameResult | Exception"], None]
-
-
-@dataclass(frozen=True, slots=True)
-class FrameResult:
-    """The prediction for a frame, its engine's provenance, and the time of each stage in ms."""
-
-    prediction: Prediction
-    provenance: dict[str, str]
-    queue_ms: float
-    decode_ms: float
-    forward_ms: float
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """An image to process. Times are in ns of the monotonic clock.
-
-    `stream` is 0 for a frame without a stream. A `small` image is decoded in less time than the
-    engine takes; `cost_ms` is the estimated decoding time. `source` is the image's camera if
-    its pixels are warped into the view of the model's camera.
-    """
-
-    read: PixelReader
-    stamp_ns: int
-    stream: int = 0
-    deadline_ns: int | None = None
-    small: bool = False
-    client: str = ""
-    cost_ms: float = 0.0
-    source: CameraParameters | None = None
+PRESENT_NS = 1_000_000_000  # a client counts as present for this time after each of its frames
 
 
 class Slot:
@@ -73,6 +32,8 @@ class FairQueue:
         self._counts: Counter[str] = Counter()  # slots of each client
         self._turns: dict[str, int] = {}  # number of the latest turn of each client
         self._turn = 0
+        self._newest: tuple[str, int] = ("", -PRESENT_NS)  # latest client, time in ns
+        self._other: tuple[str, int] = ("", -PRESENT_NS)  # the client before it
         self.count = 0
         """Number of slots."""
 
@@ -80,6 +41,19 @@ class FairQueue:
     def all_small(self) -> bool:
         """Whether all waiting frames are small."""
         return all(slot.frame.small for slot in self._slots)
+
+    def note(self, client: str, now_ns: int) -> None:
+        """Record that a client has sent a frame, which may be refused."""
+        client = network_of(client)
+        if client != self._newest[0]:
+            self._other = self._newest
+        self._newest = (client, now_ns)
+
+    def others_present(self, client: str, now_ns: int) -> bool:
+        """Whether another client than `client` is present."""
+        same = self._newest[0] == network_of(client)
+        latest_ns = (self._other if same else self._newest)[1]
+        return now_ns - latest_ns < PRESENT_NS
 
     def append(self, slot: Slot) -> None:
         """Append a slot."""
@@ -125,46 +99,3 @@ class FairQueue:
         self._counts[slot.client] -= 1
         if not self._counts[slot.client]:
             del self._counts[slot.client]
-
-
-class FairLock:
-    """A lock for the coroutines of one event loop; waiting clients take turns."""
-
-    def __init__(self) -> None:
-        self._locked = False
-        # Waiting coroutines of each client; the first client is the next to get the lock.
-        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
-
-    @asynccontextmanager
-    async def held(self, client: str) -> AsyncIterator[None]:
-        """Wait for the lock, and hold it within the context."""
-        if self._locked:
-            await self._wait(network_of(client))
-        self._locked = True
-        try:
-            yield
-        finally:
-            self._release()
-
-    async def _wait(self, client: str) -> None:
-        turn = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(client, deque()).append(turn)
-        try:
-            await turn
-        except asyncio.CancelledError:
-            if not turn.cancelled():  # cancelled after it got the lock
-                self._release()
-            raise
-
-    def _release(self) -> None:
-        """Give the lock to the next waiting client, or unlock."""
-        while self._waiting:
-            client, turns = next(iter(self._waiting.items()))
-            del self._waiting[client]
-            turn = turns.popleft()
-            if turns:
-                self._waiting[client] = turns
-            if not turn.done():
-                turn.set_result(None)
-                return
-        self._locked = False

@@ -26,9 +26,10 @@ import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
-from serve.api.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
+from serve.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
 from serve.scheduling.admission import Admission
-from serve.scheduling.fair_queue import FairQueue, Frame, FrameResult, ResultCallback, Slot
+from serve.scheduling.fair_queue import FairQueue, Slot
+from serve.scheduling.frame import Frame, FrameResult, ResultCallback
 from serve.scheduling.streams import StreamTable
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
@@ -68,7 +69,7 @@ class StagedEngine:
 class FrameQueue:
     """Processes frames with one engine, one at a time. Start it in a running event loop.
 
-    Call `submit` and `check_capacity` in this loop's thread only. `stage_model` and
+    Call `submit` and `refusal` in this loop's thread only. `stage_model` and
     `drop_staged_model` can be called in any thread.
     """
 
@@ -93,8 +94,8 @@ class FrameQueue:
         self._streams = streams
         self._capacity = capacity
         self.single_core = single_core
-        self._admission = Admission()
         self._waiting = FairQueue()
+        self._admission = Admission(self._waiting)
         self._queue_lock = threading.Lock()  # for _waiting; held briefly
         self._thread_busy = False  # the thread is processing a frame
         self._dispatched = False  # the loop or the thread will check the queue
@@ -173,23 +174,14 @@ class FrameQueue:
     def refusal(self, client: str) -> Problem | None:
         """The problem if the queue has no room for a client's frame, else None.
 
-        Many frames share this object, so it must not be raised.
+        Many frames share this object: whoever raises it must drop its traceback.
         """
-        if not self._has_no_room(client):
-            return None
-        return _shared_overloaded(*self._load())
-
-    def check_capacity(self, client: str) -> None:
-        """Raise Problem if the queue has no room for a client's frame."""
-        if self._has_no_room(client):
-            raise _overloaded(*self._load())
-
-    def _has_no_room(self, client: str) -> bool:
-        """Whether the queue is full and no slot would be given up for a frame of `client`."""
         if not self.full:
-            return False
+            return None
         with self._queue_lock:
-            return self._waiting.giving_way_to(client) is None
+            if self._waiting.giving_way_to(client) is not None:
+                return None
+        return _shared_overloaded(*self._load())
 
     def submit(self, frame: Frame, on_result: ResultCallback) -> None:
         """Queue a frame; `on_result` is called on the loop with its result or its error.
@@ -197,7 +189,7 @@ class FrameQueue:
         Raises Problem at once if the queue is full or the engine is not ready.
         """
         self.check_ready()
-        self._admission.note(frame.client, frame.stamp_ns)
+        self._waiting.note(frame.client, frame.stamp_ns)
         if frame.cost_ms > LARGE_MS:
             done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
             try:

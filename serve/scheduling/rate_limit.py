@@ -8,10 +8,10 @@ import time
 from functools import lru_cache
 from hashlib import blake2b
 
-from serve.api.problems import RATE_LIMITED, Problem
 from serve.config import is_loopback
 from serve.config import network_of as network_of
-from serve.workers.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
+from serve.problems import RATE_LIMITED, Problem
+from serve.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 
 
 @lru_cache(4096)

@@ -8,7 +8,7 @@ later stamp was announced for its stream.
 from functools import lru_cache
 from hashlib import blake2b
 
-from serve.workers.shared_memory import PROBES, STREAM_ENTRIES, STREAM_WORDS
+from serve.shared_memory import PROBES, STREAM_ENTRIES, STREAM_WORDS
 
 EXPIRY_NS = 10_000_000_000  # then another stream can use the entry; no frame waits so long
 

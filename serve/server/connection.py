@@ -14,8 +14,8 @@ from typing import Any
 from httptools import HttpParserError, HttpParserUpgrade, HttpRequestParser
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
-from serve.api.http_io import encode_head, problem_reply
-from serve.api.problems import (
+from serve.config import MAX_DEADLINE_MS, MAX_HEAD_BYTES
+from serve.problems import (
     MALFORMED,
     OVERLOADED,
     TOO_MANY_CONNECTIONS,
@@ -26,7 +26,7 @@ from serve.api.problems import (
     too_many_requests,
     too_slow,
 )
-from serve.config import MAX_DEADLINE_MS, MAX_HEAD_BYTES
+from serve.replies import encode_head, problem_reply
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 from serve.server.lingering_close import LingeringTransport

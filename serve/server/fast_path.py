@@ -10,10 +10,10 @@ from http import HTTPStatus
 from typing import Any
 
 from serve.api.features import FeaturesRequest
-from serve.api.http_io import Header, Reply, encode_head
-from serve.api.problems import Problem, too_many_requests
 from serve.api.request_options import Headers
 from serve.app import Service
+from serve.problems import Problem, too_many_requests
+from serve.replies import Header, Reply, encode_head
 from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 
 CLOSE_HEADER: Header = (b"connection", b"close")
@@ -56,7 +56,7 @@ class DirectRequest:
         if self.features is None:
             return
         try:
-            self.features.grow(len(part))
+            self.features.receive(len(part))
         except Problem as problem:
             self.features.refuse(problem)
             self.drop()
@@ -121,8 +121,15 @@ class DirectProtocol(GuardedProtocol):
             not self._guard.draining and self.parser.should_keep_alive()
         )
         self._request = self._running = request = self.cycle
+        service, client = self._service, self.client[0] if self.client else ""
         send = partial(self._reply, request)
-        request.features = self._service.open(headers, self.client[0] if self.client else "", send)
+        refusal = service.access.refusal(headers, client)
+        if refusal is not None:
+            send(refusal)
+            return
+        features = service.make_request(client, send)
+        if features.open(headers):
+            request.features = features
 
     def on_body(self, body: bytes) -> None:
         if self._request is None:

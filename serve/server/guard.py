@@ -16,8 +16,8 @@ from typing import Protocol, runtime_checkable
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from serve.api.problems import TOO_MANY_CONNECTIONS, ProblemType
 from serve.config import Limits, network_of
+from serve.problems import TOO_MANY_CONNECTIONS, ProblemType
 from serve.scheduling.body_budget import BodyBudget
 
 LINGER_S = 0.5  # time for a client to read the problem before its connection is closed

@@ -18,8 +18,7 @@ from websockets.exceptions import HeaderLineTooLong, RequestLineTooLong, TooMany
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 
-from serve.api.http_io import encode_head, problem_reply
-from serve.api.problems import (
+from serve.problems import (
     HEAD_TOO_LARGE,
     INVALID_REQUEST,
     MALFORMED,
@@ -28,6 +27,7 @@ from serve.api.problems import (
     TOO_SLOW,
     Problem,
 )
+from serve.replies import encode_head, problem_reply
 from serve.scheduling.body_budget import BodyShare
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group

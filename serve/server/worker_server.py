@@ -25,7 +25,7 @@ from serve.server.fast_path import DirectProtocol
 from serve.server.guard import ConnectionGuard, Drained, close_expired
 from serve.server.heap import HeapTrimmer
 from serve.server.websocket import GuardedWebSocket
-from serve.workers.shared_memory import WorkerPeers
+from serve.shared_memory import WorkerPeers
 
 GRACE_S = 5  # time for requests in progress when the service stops
 LAST_S = 1.0  # time after GRACE_S for clients to read why they got no answer

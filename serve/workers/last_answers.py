@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from runtime.sockets import refuse_connections
-from serve.api.http_io import encode_head, problem_reply
-from serve.api.problems import stopping
+from serve.problems import stopping
+from serve.replies import encode_head, problem_reply
 
 REQUEST_S = 1.0  # time for a new connection to send its request
 READ_S = 2.0  # time for a client to send the rest of its request and to read the answer

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from serve.config import Limits
-from serve.workers.last_answers import LastAnswers
-from serve.workers.shared_memory import (
+from serve.shared_memory import (
     COMMITTED_GENERATION,
     SharedMemory,
     WorkerPeers,
     create_shared_memory,
 )
+from serve.workers.last_answers import LastAnswers
 from serve.workers.worker_process import WorkerProcess, WorkerTask, start_worker
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError

@@ -1,6 +1,6 @@
 """A worker process as the supervisor handles it: start, messages, end.
 
-`serve.workers.worker` describes the messages between the two processes.
+`serve.worker` describes the messages between the two processes.
 """
 
 import asyncio
@@ -170,7 +170,7 @@ async def start_worker(task: WorkerTask) -> WorkerProcess:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-m",
-                "serve.workers.worker",
+                "serve.worker",
                 str(theirs.fileno()),
                 pass_fds=(theirs.fileno(), *task.listeners, task.memory),
                 start_new_session=True,  # Ctrl-C goes to the supervisor only

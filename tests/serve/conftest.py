@@ -27,16 +27,16 @@ import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import WEIGHTS, ModelCard, golden_image
 from runtime.sockets import bind
-from serve.api.problems import PROBLEM_TYPES
+from serve import shared_memory
 from serve.app import Service
 from serve.cameras import Cameras
 from serve.config import Limits
 from serve.observability import metrics
+from serve.problems import PROBLEM_TYPES
 from serve.server import guard
 from serve.server.connection import GuardedProtocol
 from serve.server.worker_server import WorkerServer
-from serve.workers import shared_memory
-from serve.workers.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
+from serve.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
 from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from serve.app import Service
-from serve.workers.shared_memory import create_shared_memory
+from serve.shared_memory import create_shared_memory
 from tests.serve.conftest import (
     CARD,
     PATIENCE_S,

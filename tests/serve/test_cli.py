@@ -21,7 +21,7 @@ from mtlnet.inference.model_card import CARD, SHIPPED, golden_image, read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.client import Client
-from serve.workers.worker import SupervisorConnection, send_ready
+from serve.worker import SupervisorConnection, send_ready
 from tests.serve.conftest import PATIENCE_S, png, until
 from tests.typed import typed
 

@@ -9,11 +9,11 @@ from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from serve.api.problems import Problem
+from serve import shared_memory
 from serve.config import Limits, is_loopback
+from serve.problems import Problem
 from serve.scheduling.rate_limit import RateLimiter
 from serve.server.guard import EVICTABLE_S, ConnectionGuard, Group
-from serve.workers import shared_memory
 from tests.serve.conftest import (
     PATIENCE_S,
     Clock,

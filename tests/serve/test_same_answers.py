@@ -20,7 +20,7 @@ from mtlnet.inference.image_decoding.decode import decode, inspect
 from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from serve.scheduling.warmup import TOLERANCE, warm_up
-from serve.workers.shared_memory import create_shared_memory
+from serve.shared_memory import create_shared_memory
 from tests.serve.conftest import PATIENCE_S, Served, jpeg, picture, serving, until
 from trackfeatures.camera import CameraParameters
 

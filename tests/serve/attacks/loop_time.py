@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from mtlnet.inference.image_decoding.errors import ImageError
-from serve.api.problems import Problem
+from serve.problems import Problem
 from tests.serve.conftest import PATIENCE_S, Served
 
 LOOP_S = 0.02  # longest time for which a request may block the event loop

@@ -7,14 +7,16 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from serve.api.hosts import HostCheck, host_name
-from serve.api.problems import Problem
+from runtime.access import host_name
+from serve.api.access import HostCheck
 from serve.cli import app
 from serve.config import Limits, ServiceConfig, check_proxies, network_of, read_token
+from serve.problems import Problem
 from serve.scheduling.admission import MAX_CLIENT_MS, Admission
+from serve.scheduling.fair_queue import FairQueue
 from serve.scheduling.rate_limit import RateLimiter, client_key
 from serve.scheduling.streams import stream_key
-from serve.workers.shared_memory import create_shared_memory
+from serve.shared_memory import create_shared_memory
 from serve.workers.worker_process import WorkerTask
 from tests.serve.conftest import (
     PATIENCE_S,
@@ -176,15 +178,15 @@ def test_a_64_is_one_client_and_ipv4_in_ipv6_is_ipv4() -> None:
 
 
 def test_large_images_from_a_64_count_as_one_clients() -> None:
-    admission = Admission()
+    admission = Admission(FairQueue())
     admission.admit("2001:db8::1", MAX_CLIENT_MS, 0)
     with pytest.raises(Problem, match="of this client"):
         admission.admit("2001:db8::2", MAX_CLIENT_MS, 0)
     admission.admit("2001:db8:0:1::1", MAX_CLIENT_MS, 0)
-    alone = Admission()
+    waiting = FairQueue()
     for number in range(9):
-        alone.note(f"2001:db8::{number}", number)
-    alone.admit("2001:db8::a", 2 * MAX_CLIENT_MS, 9)()  # no other client is present
+        waiting.note(f"2001:db8::{number}", number)
+    Admission(waiting).admit("2001:db8::a", 2 * MAX_CLIENT_MS, 9)()  # no other client is present
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from serve.api.kserve_tensors import (
     parse_request,
     read_image_bytes,
 )
-from serve.api.problems import Problem
 from serve.config import MAX_BODY_BYTES
+from serve.problems import Problem
 from tests.serve.attacks.loop_time import LOOP_S, held_s
 from tests.serve.conftest import Served, types_in_cycles
 

@@ -12,9 +12,9 @@ import time
 import pytest
 
 from benchmarks.service_stream_fuzz import run_part
-from serve.api.problems import UNAUTHORIZED, Problem
 from serve.config import Limits
 from serve.observability.logs import ErrorLimit, Interval, JsonFormatter, RefusalLog
+from serve.problems import UNAUTHORIZED, Problem
 from tests.serve.attacks import attacks
 from tests.serve.attacks.conftest import Target, open_count
 from tests.serve.conftest import (

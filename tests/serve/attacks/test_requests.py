@@ -29,12 +29,13 @@ from mtlnet.inference.image_decoding.jpeg_structure import (
     read_structure,
 )
 from serve.api.features import SMALL_MS
-from serve.api.problems import Problem
 from serve.api.request_options import MAX_ACCEPT, negotiate
 from serve.config import MAX_BODY_BYTES, Limits
-from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, PRESENT_NS, Admission
+from serve.problems import Problem
+from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, Admission
 from serve.scheduling.body_budget import BodyBudget, BodyShare
-from serve.workers.shared_memory import create_shared_memory
+from serve.scheduling.fair_queue import PRESENT_NS, FairQueue
+from serve.shared_memory import create_shared_memory
 from tests.serve.attacks.loop_time import LOOP_S, held_s
 from tests.serve.conftest import (
     CARD,
@@ -190,13 +191,14 @@ def test_a_client_has_one_large_image_at_a_time() -> None:
 
 
 def test_shares_of_the_engine() -> None:
-    admission, now = Admission(), 10**12
+    waiting, now = FairQueue(), 10**12
+    admission = Admission(waiting)
     for _ in range(20):  # a client that is alone has no limit
-        admission.note("a", now)
+        waiting.note("a", now)
         admission.admit("a", 700.0, now)()
         now += 700_000_000
-    admission.note("b", now)
-    admission.note("a", now)
+    waiting.note("b", now)
+    waiting.note("a", now)
     with pytest.raises(Problem, match="would take 700 ms"):  # b's frames would overflow the queue
         admission.admit("a", 700.0, now)
     with pytest.raises(Problem, match="beyond this client's share") as caught:
@@ -204,10 +206,10 @@ def test_shares_of_the_engine() -> None:
     assert caught.value.retry_after_ms == pytest.approx((700 - 0.25 * 700) / 0.25)
     admission.admit("b", 100.0, now)()  # b has not used its share
     later = now + PRESENT_NS
-    admission.note("a", later)
+    waiting.note("a", later)
     admission.admit("a", 700.0, later)()  # alone again
 
-    full = Admission()
+    full = Admission(FairQueue())
     done = [
         full.admit(f"c{n}", MAX_CLIENT_MS, now) for n in range(int(MAX_PENDING_MS // MAX_CLIENT_MS))
     ]
@@ -220,7 +222,7 @@ def test_shares_of_the_engine() -> None:
 
 
 def test_the_shares_of_many_addresses_are_bounded() -> None:
-    admission = Admission()
+    admission = Admission(FairQueue())
     for number in range(3000):
         admission.admit(str(number), 100.0, number)()
     assert len(admission._credit) <= 1024

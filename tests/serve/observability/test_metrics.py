@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from serve.api.problems import PROBLEM_TYPES
+from serve import shared_memory
 from serve.config import Limits
 from serve.observability import logs
 from serve.observability.logs import REFUSALS_PER_S, JsonFormatter
-from serve.workers import shared_memory
+from serve.problems import PROBLEM_TYPES
 from tests.serve.conftest import Clock, FakeEngine, Served, jpeg, outputs, picture, serving
 
 JPEG = jpeg(picture())

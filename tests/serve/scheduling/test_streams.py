@@ -6,9 +6,9 @@ from contextlib import contextmanager
 
 import pytest
 
+from serve import shared_memory
 from serve.scheduling.streams import EXPIRY_NS, StreamTable, stream_key
-from serve.workers import shared_memory
-from serve.workers.shared_memory import PROBES
+from serve.shared_memory import PROBES
 from tests.serve.conftest import (
     PATIENCE_S,
     FakeEngine,

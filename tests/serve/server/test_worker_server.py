@@ -5,11 +5,11 @@ import time
 
 import pytest
 
+from serve import shared_memory
 from serve.config import Limits
 from serve.server import worker_server
 from serve.server.worker_server import WorkerServer
-from serve.workers import shared_memory
-from serve.workers.shared_memory import WorkerPeers
+from serve.shared_memory import WorkerPeers
 from tests.serve.conftest import (
     PATIENCE_S,
     FakeEngine,

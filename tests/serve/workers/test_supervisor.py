@@ -11,8 +11,8 @@ import pytest
 
 from runtime.sockets import bind
 from serve.config import Limits
+from serve.shared_memory import BODY_BYTES
 from serve.workers import supervisor as module
-from serve.workers.shared_memory import BODY_BYTES
 from serve.workers.supervisor import ServicePlan, Supervisor
 from serve.workers.worker_process import WorkerProcess, WorkerTask
 from tests.serve.conftest import PATIENCE_S

@@ -1,5 +1,5 @@
 """One worker process: one engine, one event loop. `serve.workers.supervisor` starts it as
-`python -m serve.workers.worker FD`; the two exchange lines of JSON over the socket FD.
+`python -m serve.worker FD`; the two exchange lines of JSON over the socket FD.
 
 The supervisor sends the WorkerTask, then {"load": folder, "generation": n} and {"drop": n}. The
 worker sends {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
@@ -21,7 +21,7 @@ from serve.app import Service
 from serve.observability import logs, telemetry
 from serve.scheduling.warmup import warm_up
 from serve.server.worker_server import WorkerServer
-from serve.workers.shared_memory import (
+from serve.shared_memory import (
     COMMITTED_GENERATION,
     WorkerPeers,
     attach_shared_memory,

@@ -9,7 +9,7 @@ from math import ceil
 from typing import Any
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
-from serve.config import MAX_HEAD_BYTES
+from serve.config import MAX_BODY_BYTES, MAX_HEAD_BYTES
 from trackfeatures.errors import UserError
 
 MEDIA_TYPE = "application/problem+json"
@@ -132,6 +132,15 @@ def as_problem(error: Problem | ImageError) -> Problem:
 def internal_error() -> Problem:
     """The problem of an unexpected exception; the exception's text is not sent to the client."""
     return Problem(INTERNAL, "the request could not be answered; see the service's log")
+
+
+def body_too_large(seen: str) -> Problem:
+    """The problem of a body that is too large; `seen` describes its size."""
+    return Problem(
+        BODY_TOO_LARGE,
+        f"the body has {seen}; the limit is {MAX_BODY_BYTES}: send a smaller image or "
+        "compress it more",
+    )
 
 
 def head_too_large() -> Problem:

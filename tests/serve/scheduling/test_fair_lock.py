@@ -3,7 +3,7 @@
 import asyncio
 from contextlib import suppress
 
-from serve.scheduling.fair_queue import FairLock
+from serve.scheduling.fair_lock import FairLock
 
 
 def order_of(clients: list[str], cancelled: tuple[int, ...] = ()) -> list[int]:
