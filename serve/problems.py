@@ -129,6 +129,15 @@ def as_problem(error: Problem | ImageError) -> Problem:
     return Problem(problem_type, f"{error}{HINTS.get(problem_type, '')}")
 
 
+def forget_frames(error: BaseException) -> None:
+    """Drop the tracebacks of an error and of its causes: their frames can reference the body of the
+    request, and the error itself, which makes a cycle."""
+    found: BaseException | None = error
+    while found is not None:
+        found.__traceback__ = None
+        found = found.__cause__ or found.__context__
+
+
 def internal_error() -> Problem:
     """The problem of an unexpected exception; the exception's text is not sent to the client."""
     return Problem(INTERNAL, "the request could not be answered; see the service's log")

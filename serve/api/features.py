@@ -36,7 +36,7 @@ from serve.api.request_options import (
 from serve.cameras import Cameras
 from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
-from serve.problems import INVALID_REQUEST, Problem, as_problem, internal_error
+from serve.problems import INVALID_REQUEST, Problem, as_problem, forget_frames, internal_error
 from serve.replies import Reply, problem_reply
 from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.scheduling.frame import Frame, FrameResult, PixelReader, ResultCallback
@@ -64,24 +64,23 @@ class Sight:
     fov_y_deg: float | None = None
     camera: CameraParameters | None = None
 
-    def check(self, width: int, height: int, view: CameraParameters) -> None:
-        """Raise ImageError if an image of this size in px does not cover what `view` shows."""
-        if self.camera is None:
-            crop_box(width, height, view, self.fov_y_deg)
-        else:
+    def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
+        """[left, top, width, height] in px of the part of an image that the model's camera `view`
+        shows; None if that is the whole image, or if the image is warped.
+
+        Raises ImageError if an image of this size does not cover what `view` shows.
+        """
+        if self.camera is not None:
             Rectification(self.camera, view).check(width, height)
+            return None
+        box = crop_box(width, height, view, self.fov_y_deg)
+        return None if box is None else [box.left, box.top, box.width, box.height]
 
     def through(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
         """`image` (H, W, 3) as seen by the model's camera `view`. Raises ImageError."""
         if self.camera is None:
             return crop_and_resize(image, view, self.fov_y_deg)
         return Rectification(self.camera, view).image(image)
-
-    def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
-        """[left, top, width, height] in px of the part that the model sees. None if the whole image
-        is used or the image is warped."""
-        box = None if self.camera else crop_box(width, height, view, self.fov_y_deg)
-        return None if box is None else [box.left, box.top, box.width, box.height]
 
 
 class FrameHandler:
@@ -119,20 +118,16 @@ class FrameHandler:
         self.queue.check_ready()
         camera, sight = self.queue.loaded.engine.card.camera, self.sight(options)
         header = read_header(body)
-        sight.check(header.width, header.height, camera)
-        read_ms = header.decode_ms
-        small = header.width * header.height <= SMALL_PIXELS and read_ms <= SMALL_MS
+        crop = sight.crop_px(header.width, header.height, camera)
+        small = header.width * header.height <= SMALL_PIXELS and header.decode_ms <= SMALL_MS
         small = small and (len(body) <= SMALL_BYTES or header.png_header is not None)
-        frame = _frame(
-            options,
-            client,
-            lambda view: sight.through(decode_whole(body, header), view),
-            read_ms,
-            small,
-            sight,
-        )
+
+        def read(view: CameraParameters) -> NDArray[np.uint8]:
+            return sight.through(decode_whole(body, header), view)
+
+        frame = _frame(options, client, read, header.decode_ms, small, sight)
         self.queue.submit(frame, on_result)
-        return sight.crop_px(header.width, header.height, camera)
+        return crop
 
     def sight(self, options: RequestOptions) -> Sight:
         """The camera of a request's image. Raises Problem for an unknown camera."""
@@ -214,15 +209,6 @@ class FrameHandler:
         """Count a refused request, and log it."""
         self.refusals.log(request_id, client, problem)
         self._metrics.count_refusal(problem.type, self.queue.waiting)
-
-
-def forget_frames(error: BaseException) -> None:
-    """Drop the tracebacks of an error and of its causes: their frames can reference the body of the
-    request, and the error itself, which makes a cycle."""
-    found: BaseException | None = error
-    while found is not None:
-        found.__traceback__ = None
-        found = found.__cause__ or found.__context__
 
 
 class FeaturesRequest:

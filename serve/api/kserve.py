@@ -225,11 +225,11 @@ async def _pixel_reader(
     if tensor.name == "image":
         body = await read_image_bytes(tensor, binary)
         header = read_header(body)
-        sight.check(header.width, header.height, camera)
+        sight.crop_px(header.width, header.height, camera)
         return lambda view: sight.through(decode_whole(body, header), view), header.decode_ms
     pixels = find_pixels(tensor, binary)
     check_size(pixels.width, pixels.height)
-    sight.check(pixels.width, pixels.height, camera)
+    sight.crop_px(pixels.width, pixels.height, camera)
     return lambda view: sight.through(pixels.read(), view), pixels.read_ms
 
 

@@ -164,8 +164,7 @@ def _outputs(raw: msgspec.Raw) -> list[RequestedOutput]:
 
 def _parameters(raw: msgspec.Raw, known: dict[str, str], where: str) -> dict[str, Any]:
     """The parameters in `where`. Raises Problem, also for a parameter that is not `known`."""
-    if len(memoryview(raw)) > MAX_SMALL_BYTES:
-        raise _too_large()
+    _check_small(raw)
     found = parse_json_object(bytes(raw), where)
     if found is None:
         raise invalid_request(f"{where} must be a JSON object; send one, or leave it out")
@@ -184,16 +183,16 @@ def take_options(request: InferRequest) -> dict[str, Any]:
     return {name: value for name, value in request.parameters.items() if name in OPTIONS}
 
 
-def _too_large() -> Problem:
-    return invalid_request(
-        f"a shape, the outputs or the parameters exceed {MAX_SMALL_BYTES} bytes; send fewer"
-    )
+def _check_small(raw: msgspec.Raw) -> None:
+    if len(memoryview(raw)) > MAX_SMALL_BYTES:
+        raise invalid_request(
+            f"a shape, the outputs or the parameters exceed {MAX_SMALL_BYTES} bytes; send fewer"
+        )
 
 
 def _small(raw: msgspec.Raw, kind: type[T]) -> T:
     """Decode a part of a request of at most MAX_SMALL_BYTES. Raises Problem, DecodeError."""
-    if len(memoryview(raw)) > MAX_SMALL_BYTES:
-        raise _too_large()
+    _check_small(raw)
     return msgspec.json.decode(raw, type=kind)
 
 

@@ -18,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from queue import SimpleQueue
 
@@ -30,40 +29,15 @@ from serve.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, P
 from serve.scheduling.admission import Admission
 from serve.scheduling.fair_queue import FairQueue, Slot
 from serve.scheduling.frame import Frame, FrameResult, ResultCallback
+from serve.scheduling.loaded_engine import LoadedEngine, StagedEngine
 from serve.scheduling.streams import StreamTable
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
 INLINE_MAX_MS = 10.0  # longest time per frame at which frames are processed on the event loop
 LARGE_MS = 30.0  # images with a longer decoding time need an admission; a JPEG of 3 Mpx has this
 INLINE_AFTER = 8  # consecutive frames within INLINE_MAX_MS before the event loop runs the engine
+
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class LoadedEngine:
-    """An engine, and the members of every answer that identify the engine and its model."""
-
-    engine: Engine
-    provenance: dict[str, str]
-
-    @classmethod
-    def of(cls, engine: Engine) -> "LoadedEngine":
-        """`engine` with its provenance."""
-        provenance = {
-            "model": engine.card.model_hash,
-            "definitions_version": tf.VERSION,
-            "engine": engine.kind,
-            "precision": engine.precision,
-        }
-        return cls(engine, provenance)
-
-
-@dataclass(frozen=True, slots=True)
-class StagedEngine:
-    """An engine that replaces the current engine as soon as `is_committed()` is true."""
-
-    loaded: LoadedEngine
-    is_committed: Callable[[], bool]
 
 
 class FrameQueue:
@@ -191,18 +165,27 @@ class FrameQueue:
         self.check_ready()
         self._waiting.note(frame.client, frame.stamp_ns)
         if frame.cost_ms > LARGE_MS:
-            done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
-            try:
-                refuse = self._enqueue(frame, _after(done, on_result))
-            except Problem:
-                done()
-                raise
+            refuse = self._enqueue_large(frame, on_result)
         else:
             refuse = self._enqueue(frame, on_result)
         if refuse is not None:
             refuse()
         if frame.stream:
             self._streams.announce(frame.stream, frame.stamp_ns)
+
+    def _enqueue_large(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
+        """Like `_enqueue`, for a frame that needs an admission until its result is known."""
+        done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
+
+        def finish(result: FrameResult | Exception) -> None:
+            done()
+            on_result(result)
+
+        try:
+            return self._enqueue(frame, finish)
+        except Problem:
+            done()
+            raise
 
     def _enqueue(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
         """Queue a frame. Returns the function that refuses the frame it replaces, if there is one.
@@ -342,13 +325,3 @@ def _overloaded(waiting: int, wait_ms: int) -> Problem:
 
 
 _shared_overloaded = lru_cache(64)(_overloaded)
-
-
-def _after(done: Callable[[], None], on_result: ResultCallback) -> ResultCallback:
-    """A callback that calls `done`, then `on_result`."""
-
-    def call(result: FrameResult | Exception) -> None:
-        done()
-        on_result(result)
-
-    return call

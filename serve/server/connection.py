@@ -2,8 +2,7 @@
 
 This is uvicorn's httptools protocol, extended by a deadline for each phase of a connection.
 `close_expired` checks the deadlines ten times per second, so a deadline costs a request only a few
-assignments. Trailers count as headers and are dropped. An upgrade to anything but WebSocket is
-ignored, as RFC 9110 (7.8) allows.
+assignments. Trailers count as headers and are dropped.
 """
 
 import asyncio
@@ -11,7 +10,7 @@ from enum import Enum, auto
 from math import inf
 from typing import Any
 
-from httptools import HttpParserError, HttpParserUpgrade, HttpRequestParser
+from httptools import HttpParserError, HttpParserUpgrade
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from serve.config import MAX_DEADLINE_MS, MAX_HEAD_BYTES
@@ -30,14 +29,12 @@ from serve.replies import encode_head, problem_reply
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 from serve.server.lingering_close import LingeringTransport
-from serve.server.upgrade import UPGRADE_HEADERS, repeat_head
-from serve.server.websocket import GuardedWebSocket
+from serve.server.upgrade import parse_upgrades
 
 # Below, a part means the bytes of one read from the socket.
 WORK_S = 2e-3 * MAX_DEADLINE_MS  # longest time for an answer: twice the longest deadline
 MAX_PIPELINED = 16  # requests of one connection that wait for the reply to an earlier one
 MAX_AT_ONCE = 32  # requests in one part; more would block the event loop
-MAX_UPGRADES = 4  # upgrade requests in one part
 # A body can have FREE_CHUNKS chunks, and one more for each CHUNK_BYTES received.
 FREE_CHUNKS, CHUNK_BYTES = 512, 512
 
@@ -57,7 +54,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def __init__(self, *arguments: Any, guard: ConnectionGuard, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self._guard = guard
+        self.guard = guard
         self.group: Group = {}
         self.network = ""
         self.since_s = 0.0  # start of this phase
@@ -65,7 +62,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._settled: Phase | None = None  # the phase for which group and deadline are set
         self._deadline_s = inf
         self._idle_group = guard.idle
-        self._upgrading = False
+        self.upgrading = False
         self._running: Any = None  # the request being answered; `cycle` is the last one received
         self._fault: Problem | None = None  # why a callback has stopped the parser
         self._body_lingers = False  # the last reply was sent before the request's end arrived
@@ -91,14 +88,20 @@ class GuardedProtocol(HttpToolsProtocol):
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
         # Answers sent before draining began had no "Connection: close", so the client can send
         # one more request.
-        if idle and min(elapsed_s, self._guard.clock() - self.since_s) >= guards.DRAIN_S:
+        if idle and min(elapsed_s, self.guard.clock() - self.since_s) >= guards.DRAIN_S:
             self.linger()
         return self._phase is Phase.CLOSING and not (self._body_lingers and self.lingers)
 
     def end_draining(self) -> None:
         """Refuse an incomplete or unanswered request, and close the connection."""
         if self._phase is not Phase.CLOSING:
-            self._close_with(stopping())
+            self.close_with(stopping())
+
+    def leave(self) -> None:
+        """Give up the connection to a WebSocket."""
+        self.connections.discard(self)
+        self._phase, self._deadline_s = Phase.CLOSING, inf
+        self.group.pop(self, None)
 
     def close_after_reply(self) -> None:
         """Close the connection after the reply to the latest received request."""
@@ -108,7 +111,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def end(self) -> None:
         """Close after the last reply; with a lingering close if the client can still be sending."""
-        lingers = self._guard.draining or self._phase is Phase.BODY
+        lingers = self.guard.draining or self._phase is Phase.BODY
         (self.linger if lingers else self.transport.close)()
 
     def linger(self) -> None:
@@ -119,9 +122,9 @@ class GuardedProtocol(HttpToolsProtocol):
         self._body_lingers = self._phase is Phase.BODY  # the client can still send all of the body
         self._phase = Phase.CLOSING
         self.pipeline.clear()  # "Connection: close" implies that these requests get no answer
-        now = self._guard.place(self, self._guard.refused)
+        now = self.guard.place(self, self.guard.refused)
         unsent = self.transport.get_write_buffer_size()
-        limits = self._guard.limits
+        limits = self.guard.limits
         linger_s = limits.body_s if self._body_lingers else guards.LINGER_S
         self._deadline_s = now + (limits.idle_s if unsent else linger_s)
         if not self.transport.is_closing():
@@ -129,13 +132,13 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._guard.admit(self, self.client[0] if self.client else "")
+        self.guard.admit(self, self.client[0] if self.client else "")
         self._settle()
-        guard, limit = self._guard, self._guard.limits.connections
+        guard, limit = self.guard, self.guard.limits.connections
         count = len(self.connections) - len(guard.closing) + guard.other_connections()
         if count > limit and not guard.make_room_for(self, count - limit):
             detail = f"{limit} connections are open; use one connection for all requests"
-            self._close_with(Problem(TOO_MANY_CONNECTIONS, detail))
+            self.close_with(Problem(TOO_MANY_CONNECTIONS, detail))
 
     def data_received(self, data: bytes) -> None:
         phase = self._phase
@@ -144,25 +147,25 @@ class GuardedProtocol(HttpToolsProtocol):
         if phase is Phase.IDLE:
             self._unread_bytes = self._known_bytes = 0
             self._phase = Phase.HEAD
-        self._guard.reading = self
+        self.guard.reading = self
         self._part_bytes = len(data)
         self._part_requests = 0
         self._unread_bytes += self._part_bytes
         try:
-            upgrade_at = self._feed(data)
+            upgrade_at = self.feed(data)
             if upgrade_at is not None:
-                self._feed_again(data[upgrade_at:])
+                parse_upgrades(self, data[upgrade_at:])
         except HttpParserError:
             if self._phase is not Phase.CLOSING:
                 self.send_400_response("")
         # Incomplete headers and trailers are counted as they arrive.
         excess = self._unread_bytes - self._known_bytes > MAX_HEAD_BYTES
         if excess and self._phase is not Phase.CLOSING:
-            self._close_with(head_too_large())
+            self.close_with(head_too_large())
         if self._settled is not self._phase:
             self._settle()
 
-    def _feed(self, data: bytes) -> int | None:
+    def feed(self, data: bytes) -> int | None:
         """Parse `data`. Returns the offset after the headers of a request with an upgrade, or None
         if there is no such request."""
         try:
@@ -170,22 +173,6 @@ class GuardedProtocol(HttpToolsProtocol):
         except HttpParserUpgrade as upgrade:
             return int(upgrade.args[0])
         return None
-
-    def _feed_again(self, rest: bytes) -> None:
-        """Parse the bytes that follow the headers of a request with an upgrade."""
-        for _ in range(MAX_UPGRADES):
-            rest = self._upgrade(rest)
-            upgrade_at = self._feed(rest) if rest else None
-            if upgrade_at is None:
-                return
-            rest = rest[upgrade_at:]
-        self._close_with(too_many_requests(f"{MAX_UPGRADES} upgrades"))
-
-    def on_header(self, name: bytes, value: bytes) -> None:
-        if self._phase is Phase.BODY:
-            self.drop_trailer(name, value)
-        else:
-            super().on_header(name, value)
 
     def drop_trailer(self, name: bytes, value: bytes) -> None:
         """Count a trailer. Stops the parser with ValueError if the trailers are too large."""
@@ -201,19 +188,16 @@ class GuardedProtocol(HttpToolsProtocol):
         self._phase = Phase.BODY
 
     def begin_upgrade(self) -> None:
-        """Mark the request for `_upgrade`, which handles it after the parser has returned."""
+        """Mark the request for `parse_upgrades`, which handles it after the parser has returned."""
         self._check_head_size()
-        self._upgrading = True
+        self.upgrading = True
 
     def on_headers_complete(self) -> None:
-        if self.parser.should_upgrade():
-            self.begin_upgrade()
-            return
         self.begin_body()
         if len(self.pipeline) >= MAX_PIPELINED:
             self.stop_parser(too_many_requests(f"{MAX_PIPELINED} requests"))
         super().on_headers_complete()
-        if self.cycle is not None and (self._guard.draining or not self.cycle.keep_alive):
+        if self.cycle is not None and (self.guard.draining or not self.cycle.keep_alive):
             self.close_after_reply()
 
     def on_chunk_header(self) -> None:
@@ -230,14 +214,14 @@ class GuardedProtocol(HttpToolsProtocol):
         """Begin the work phase, or the idle phase if the answer was already sent."""
         if self._phase is Phase.CLOSING:
             self._body_lingers = False
-            self._deadline_s = min(self._deadline_s, self._guard.clock() + guards.LINGER_S)
+            self._deadline_s = min(self._deadline_s, self.guard.clock() + guards.LINGER_S)
             return
         self._unread_bytes = self._known_bytes = self._part_bytes
         waits = not (self.cycle is None or self.cycle.response_complete)
         self._phase = Phase.WORK if waits else Phase.IDLE
 
     def on_message_complete(self) -> None:
-        if self._upgrading:  # `_feed_again` follows
+        if self.upgrading:  # `parse_upgrades` follows
             return
         self.on_body_complete()
         super().on_message_complete()
@@ -255,16 +239,16 @@ class GuardedProtocol(HttpToolsProtocol):
     def pause_writing(self) -> None:
         super().pause_writing()
         # The time of an idle connection; a refused connection already has an earlier deadline.
-        self._deadline_s = min(self._deadline_s, self._guard.clock() + self._guard.limits.idle_s)
+        self._deadline_s = min(self._deadline_s, self.guard.clock() + self.guard.limits.idle_s)
 
     def resume_writing(self) -> None:
         super().resume_writing()
         if self._phase is Phase.WORK:
-            self._deadline_s = self._guard.clock() + WORK_S
+            self._deadline_s = self.guard.clock() + WORK_S
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._phase, self._deadline_s = Phase.CLOSING, inf
-        self._guard.forget(self)
+        self.guard.forget(self)
         self.abandon_requests()
         super().connection_lost(exc)
         self.pipeline.clear()  # its requests reference this connection
@@ -284,7 +268,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def _settle(self) -> None:
         """Move to the group of the current phase, and set the phase's deadline."""
-        guard, limits, phase = self._guard, self._guard.limits, self._phase
+        guard, limits, phase = self.guard, self.guard.limits, self._phase
         self._settled = phase
         if phase is Phase.IDLE:
             self._deadline_s = guard.place(self, self._idle_group) + limits.idle_s
@@ -307,55 +291,14 @@ class GuardedProtocol(HttpToolsProtocol):
         self._fault = fault
         raise ValueError(fault.detail)  # httptools' error leads to `send_400_response`
 
-    def _upgrade(self, rest: bytes) -> bytes:
-        """Hand over to a WebSocket, or refuse, and return b"". For another upgrade, return the
-        request without the upgrade headers, followed by `rest`, to be parsed again."""
-        self._upgrading = False
-        if self.parser.get_method() == b"CONNECT":
-            self.send_400_response("")
-        elif not self._should_upgrade():
-            head = self._repeated_head(ignore=UPGRADE_HEADERS)
-            self.parser = HttpRequestParser(self)
-            self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
-            return head + rest
-        elif rest or not (self.cycle is None or self.cycle.response_complete):
-            detail = "send a WebSocket handshake after all earlier replies, and no bytes behind it"
-            self._close_with(Problem(MALFORMED, detail))
-        elif self._guard.draining:
-            self._close_with(stopping())
-        else:
-            self.handle_websocket_upgrade()
-        return b""
-
-    def _repeated_head(self, ignore: frozenset[bytes] = frozenset()) -> bytes:
-        parser = self.parser
-        return repeat_head(
-            parser.get_method(), self.url, parser.get_http_version(), self.headers, ignore
-        )
-
-    def handle_websocket_upgrade(self) -> None:
-        """Hand the connection over to a `GuardedWebSocket`."""
-        head = self._repeated_head()
-        self.connections.discard(self)
-        self._phase, self._deadline_s = Phase.CLOSING, inf
-        self.group.pop(self, None)
-        websocket = GuardedWebSocket(
-            self.config, self.server_state, self.app_state, self.loop, guard=self._guard
-        )
-        websocket.network = self.network
-        websocket.connection_made(self.transport)
-        self.transport.set_protocol(websocket)
-        websocket.data_received(head)
-        self.parser = None  # type: ignore[assignment]  # breaks a reference cycle
-
     def send_400_response(self, msg: str) -> None:
         detail = "the bytes received are not an HTTP/1.1 request"
-        self._close_with(self._fault or Problem(MALFORMED, detail))
+        self.close_with(self._fault or Problem(MALFORMED, detail))
 
     def give_way(self) -> None:
         """Close an idle connection after its unsent bytes; abort a connection in another phase."""
         idle = self._phase is Phase.IDLE
-        self._phase, self._deadline_s = Phase.CLOSING, self._guard.clock() + guards.LINGER_S
+        self._phase, self._deadline_s = Phase.CLOSING, self.guard.clock() + guards.LINGER_S
         (self.transport.close if idle else self.transport.abort)()
 
     def end_slow_body(self, now: float) -> int:
@@ -363,33 +306,33 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._phase is not Phase.BODY or now - self.since_s < guards.EVICTABLE_S:
             return 0
         held = 0 if self.cycle is None or self.cycle.response_complete else self._unread_bytes
-        self._close_with(Problem(OVERLOADED, "the bodies in flight need too much memory"))
+        self.close_with(Problem(OVERLOADED, "the bodies in flight need too much memory"))
         return held
 
     def expire(self, now: float) -> None:
         """Close the connection if its deadline has passed."""
         if now < self._deadline_s:
             return
-        phase, limits = self._phase, self._guard.limits
+        phase, limits = self._phase, self.guard.limits
         if phase is Phase.HEAD and self._unread_bytes:
-            self._close_with(too_slow("headers", limits.head_s))
+            self.close_with(too_slow("headers", limits.head_s))
         elif phase is Phase.BODY:
-            self._close_with(too_slow("body", limits.body_s))
+            self.close_with(too_slow("body", limits.body_s))
         else:
             self._phase, self._deadline_s = Phase.CLOSING, inf
-            self._guard.place(self, self._guard.closing)
+            self.guard.place(self, self.guard.closing)
             # `close` would wait for a client that does not read its answer.
             idle = phase is Phase.IDLE and not self.transport.get_write_buffer_size()
             (self.transport.close if idle else self.transport.abort)()
 
-    def _close_with(self, problem: Problem) -> None:
+    def close_with(self, problem: Problem) -> None:
         """Send a problem and close. If a reply to an earlier request is owed, send that reply
         instead."""
         owed = self._running if self.pipeline or self._phase is Phase.WORK else None
         self._phase = Phase.CLOSING
-        now = self._guard.place(self, self._guard.refused)
+        now = self.guard.place(self, self.guard.refused)
         self._deadline_s = now + guards.LINGER_S
-        self._guard.count_closed(problem.type)
+        self.guard.count_closed(problem.type)
         if owed is not None:  # the client would take the problem for this reply
             self.pipeline.clear()
             self.cycle = owed

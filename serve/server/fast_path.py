@@ -117,9 +117,7 @@ class DirectProtocol(GuardedProtocol):
             super().on_headers_complete()
             return
         self.begin_body()
-        self.cycle: Any = DirectRequest(
-            not self._guard.draining and self.parser.should_keep_alive()
-        )
+        self.cycle: Any = DirectRequest(not self.guard.draining and self.parser.should_keep_alive())
         self._request = self._running = request = self.cycle
         service, client = self._service, self.client[0] if self.client else ""
         send = partial(self._reply, request)
@@ -186,9 +184,9 @@ class DirectProtocol(GuardedProtocol):
         if not request.keep_alive:
             self.end()
         if reply.status == OK:
-            self._idle_group = self._guard.served
+            self._idle_group = self.guard.served
         self.on_response_complete()
         if self.flow.write_paused:  # no more requests from a client that reads no replies
             self.flow.pause_reading()
         elif reply.status == UNAVAILABLE and self._service.frame_queue.is_thread_behind:
-            self._guard.pause_reading(self)
+            self.guard.pause_reading(self)

@@ -1,24 +1,80 @@
-"""Serialises the head of a request with an upgrade again, to feed it to another parser."""
+"""Requests with an upgrade: a handshake becomes a WebSocket; any other upgrade is ignored, as RFC
+9110 (7.8) allows."""
 
-from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-UPGRADE_HEADERS = frozenset({b"upgrade", b"http2-settings"})
+from httptools import HttpRequestParser
+
+from serve.problems import MALFORMED, Problem, stopping, too_many_requests
+from serve.server.websocket import GuardedWebSocket
+
+if TYPE_CHECKING:
+    from serve.server.connection import GuardedProtocol
+
+MAX_UPGRADES = 4  # upgrade requests in one read from the socket
+IGNORED = frozenset({b"upgrade", b"http2-settings"})  # headers of an upgrade that is ignored
 
 
-def repeat_head(
-    method: bytes,
-    url: bytes,
-    version: str,
-    headers: Iterable[tuple[bytes, bytes]],
-    ignore: frozenset[bytes] = frozenset(),
-) -> bytes:
-    """The bytes of a request's head without the headers in `ignore` (lower case), which are also
+def parse_upgrades(connection: "GuardedProtocol", rest: bytes) -> None:
+    """Handle the upgrade that stopped the parser, and parse `rest`, the bytes after its headers."""
+    for _ in range(MAX_UPGRADES):
+        rest = _upgrade(connection, rest)
+        upgrade_at = connection.feed(rest) if rest else None
+        if upgrade_at is None:
+            return
+        rest = rest[upgrade_at:]
+    connection.close_with(too_many_requests(f"{MAX_UPGRADES} upgrades"))
+
+
+def _upgrade(connection: "GuardedProtocol", rest: bytes) -> bytes:
+    """Hand over to a WebSocket, or refuse, and return b"". For another upgrade, return the request
+    without the upgrade headers, followed by `rest`, to be parsed again."""
+    connection.upgrading = False
+    if connection.parser.get_method() == b"CONNECT":
+        connection.send_400_response("")
+    elif not connection._should_upgrade():
+        head = _head(connection, ignored=IGNORED)
+        connection.parser = HttpRequestParser(connection)
+        connection.parser.set_dangerous_leniencies(lenient_data_after_close=True)
+        return head + rest
+    elif rest or not (connection.cycle is None or connection.cycle.response_complete):
+        detail = "send a WebSocket handshake after all earlier replies, and no bytes behind it"
+        connection.close_with(Problem(MALFORMED, detail))
+    elif connection.guard.draining:
+        connection.close_with(stopping())
+    else:
+        _open_websocket(connection)
+    return b""
+
+
+def _open_websocket(connection: "GuardedProtocol") -> None:
+    """Hand the connection over to a `GuardedWebSocket`."""
+    head = _head(connection)
+    connection.leave()
+    websocket = GuardedWebSocket(
+        connection.config,
+        connection.server_state,
+        connection.app_state,
+        connection.loop,
+        guard=connection.guard,
+    )
+    websocket.network = connection.network
+    websocket.connection_made(connection.transport)
+    connection.transport.set_protocol(websocket)
+    websocket.data_received(head)
+    connection.parser = None  # type: ignore[assignment]  # breaks a reference cycle
+
+
+def _head(connection: "GuardedProtocol", ignored: frozenset[bytes] = frozenset()) -> bytes:
+    """The bytes of the request's head without the headers in `ignored` (lower case), which are also
     removed from the value of `Connection`."""
-    lines = [b"%b %b HTTP/%b\r\n" % (method, url, version.encode())]
-    for name, value in headers:
-        if name == b"connection" and ignore:
+    parser = connection.parser
+    version = parser.get_http_version().encode()
+    lines = [b"%b %b HTTP/%b\r\n" % (parser.get_method(), connection.url, version)]
+    for name, value in connection.headers:
+        if name == b"connection" and ignored:
             options = [option.strip() for option in value.split(b",")]
-            value = b", ".join(o for o in options if o.lower() not in ignore)
-        if name not in ignore:
+            value = b", ".join(o for o in options if o.lower() not in ignored)
+        if name not in ignored:
             lines.append(b"%b: %b\r\n" % (name, value))
     return b"".join(lines) + b"\r\n"

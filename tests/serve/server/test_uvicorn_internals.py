@@ -24,7 +24,6 @@ RELIED_ON: dict[type, tuple[str, ...]] = {
         "connection_lost",
         "connection_made",
         "data_received",
-        "handle_websocket_upgrade",
         "on_body",
         "on_header",
         "on_headers_complete",

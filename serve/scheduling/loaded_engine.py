@@ -1,0 +1,34 @@
+"""An engine as the frame queue holds it: in use, or loaded to replace the one in use."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import trackfeatures as tf
+from mtlnet.inference.engine import Engine
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedEngine:
+    """An engine, and the members of every answer that identify the engine and its model."""
+
+    engine: Engine
+    provenance: dict[str, str]
+
+    @classmethod
+    def of(cls, engine: Engine) -> "LoadedEngine":
+        """`engine` with its provenance."""
+        provenance = {
+            "model": engine.card.model_hash,
+            "definitions_version": tf.VERSION,
+            "engine": engine.kind,
+            "precision": engine.precision,
+        }
+        return cls(engine, provenance)
+
+
+@dataclass(frozen=True, slots=True)
+class StagedEngine:
+    """An engine that replaces the current engine as soon as `is_committed()` is true."""
+
+    loaded: LoadedEngine
+    is_committed: Callable[[], bool]
