@@ -107,6 +107,15 @@ def png(image: NDArray[Any], *options: int) -> bytes:
     return data.tobytes()
 
 
+JPEG, PNG = jpeg(picture()), png(picture())
+INFER = "/v2/models/track/infer"
+
+
+def constant_engine() -> FakeEngine:
+    """An engine with the same outputs for every image."""
+    return FakeEngine(lambda _image: outputs())
+
+
 class Gate:
     """An engine that answers only after `open` is set; it sets `busy` when it begins a frame."""
 
@@ -151,7 +160,7 @@ def patient_service(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def engine() -> FakeEngine:
-    return FakeEngine(lambda _image: outputs())
+    return constant_engine()
 
 
 @dataclass(frozen=True)
@@ -239,7 +248,7 @@ class Served:
 
 @contextmanager
 def serving(
-    engine: Engine,
+    engine: Engine | None = None,
     check: Callable[[Any], object] | None = None,
     limits: Limits | None = None,
     shared: SharedMemory | None = None,
@@ -252,9 +261,9 @@ def serving(
 ) -> Iterator[Served]:
     """The service with `engine` on a free port, as `serve` runs it, in a thread of this process.
 
-    It is ready on entry unless `check` is given. With `beside` it is another worker on the port of
-    that service. `clock` in s is for the deadlines of its connections. `host` is the address to
-    listen on, `cameras` the named cameras.
+    Without `engine` it has a `constant_engine`. It is ready on entry unless `check` is given. With
+    `beside` it is another worker on the port of that service. `clock` in s is for the deadlines of
+    its connections. `host` is the address to listen on, `cameras` the named cameras.
     """
 
     def checked(engine: Engine) -> None:
@@ -263,7 +272,9 @@ def serving(
 
     listener = beside.listener.dup() if beside is not None else bind(host, 0)
     listener.listen(2048)
-    app = Service(engine, checked, limits, shared, block, tracer, cameras or {})
+    app = Service(
+        engine or constant_engine(), checked, limits, shared, block, tracer, cameras or {}
+    )
     server = WorkerServer(app, limits or Limits(), WorkerPeers(app.shared, block))
     if clock is not None:
         server.guard.clock = clock

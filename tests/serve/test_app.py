@@ -14,20 +14,18 @@ from serve.app import Service
 from serve.shared_memory import create_shared_memory
 from tests.serve.conftest import (
     CARD,
+    JPEG,
     PATIENCE_S,
     FakeEngine,
     Reply,
     Served,
     assert_problem,
-    jpeg,
+    constant_engine,
     outputs,
-    picture,
     png,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
 
 
 def test_errors_of_the_framework_are_problems(service: Served) -> None:
@@ -39,7 +37,7 @@ def test_errors_of_the_framework_are_problems(service: Served) -> None:
 
 def test_a_service_is_alive_at_once_and_ready_once_its_model_is_warm() -> None:
     gate = threading.Event()
-    engine = FakeEngine(lambda _image: outputs())
+    engine = constant_engine()
     with serving(engine, lambda _engine: gate.wait(PATIENCE_S)) as service:
         assert service.ask("GET", "/healthz").content == {"status": "alive"}
         reply = service.ask("GET", "/readyz")
@@ -138,5 +136,5 @@ def test_a_worker_without_a_second_core_uses_its_loop_alone(
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _pid: set(range(cores)))
     shared = create_shared_memory(workers + 1)  # the same as the supervisor
-    app = Service(FakeEngine(lambda _image: outputs()), shared=shared)
+    app = Service(constant_engine(), shared=shared)
     assert app.frame_queue.single_core is single

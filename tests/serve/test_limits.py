@@ -15,27 +15,23 @@ from serve.problems import Problem
 from serve.scheduling.rate_limit import RateLimiter
 from serve.server.guard import EVICTABLE_S, ConnectionGuard, Group
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     Clock,
-    FakeEngine,
     Gate,
     Served,
     assert_problem,
-    jpeg,
-    outputs,
-    picture,
     serving,
     until,
 )
 
-JPEG = jpeg(picture())
 HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
 
 
 def limited(
     limits: Limits, clock: Callable[[], float] | None = None
 ) -> AbstractContextManager[Served]:
-    return serving(FakeEngine(lambda _image: outputs()), limits=limits, clock=clock)
+    return serving(limits=limits, clock=clock)
 
 
 def dial(service: Served, source: str = "127.0.0.1") -> socket.socket:

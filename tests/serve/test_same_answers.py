@@ -21,11 +21,9 @@ from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from serve.scheduling.warmup import TOLERANCE, warm_up
 from serve.shared_memory import create_shared_memory
-from tests.serve.conftest import PATIENCE_S, Served, jpeg, picture, serving, until
+from tests.serve.conftest import INFER, JPEG, PATIENCE_S, Served, jpeg, picture, serving, until
 from trackfeatures.camera import CameraParameters
 
-JPEG = jpeg(picture())
-INFER = "/v2/models/track/infer"
 FEATURES = (
     "distances_m", "to_lane_centre_m", "angle_rad", "heading",
     "std", "out_of_distribution", "absent",

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import FrameType
 
 from tests.serve.attacks.conftest import Target, read_reply
-from tests.serve.conftest import FakeEngine, jpeg, outputs, picture, serving, until
+from tests.serve.conftest import jpeg, picture, serving, until
 
 ROOT = Path(__file__).parents[2]
 LAYERS = ("scheduling", "observability", "api", "server")  # from low to high
@@ -45,7 +45,7 @@ def test_an_image_passes_the_modules_that_the_page_names() -> None:
     recorder = Recorder()
     threading.setprofile(recorder)  # for the threads that `serving` starts
     try:
-        with serving(FakeEngine(lambda _image: outputs())) as service:
+        with serving() as service:
             target = Target(service.port)
             with target.dial() as connection:
                 ask(target, connection)  # fills the caches

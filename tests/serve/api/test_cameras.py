@@ -15,7 +15,15 @@ from serve.client import Client, ServiceError
 from serve.config import Limits
 from serve.workers.worker_process import WorkerTask
 from tests.serve.api.test_options import JPEG, WIDE, features, infer, post, stream
-from tests.serve.conftest import CARD, PATIENCE_S, FakeEngine, Served, outputs, serving
+from tests.serve.conftest import (
+    CARD,
+    PATIENCE_S,
+    FakeEngine,
+    Served,
+    constant_engine,
+    outputs,
+    serving,
+)
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -29,7 +37,7 @@ EXPECTED = decode_outputs(Rectification(ROOF, MODEL).outputs(outputs()[None])[0]
 
 @pytest.fixture
 def engine() -> FakeEngine:
-    return FakeEngine(lambda _image: outputs())
+    return constant_engine()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from fastapi import FastAPI
 
 from serve.api.console import docs_page
 from serve.config import Limits
-from tests.serve.conftest import FakeEngine, Served, outputs, serving
+from tests.serve.conftest import Served, serving
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -56,8 +56,7 @@ def test_document_text_cannot_close_the_script_element() -> None:
 
 
 def test_the_page_needs_no_token_and_offers_to_enter_one(service: Served) -> None:
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(token="0123456789abcdef")) as guarded:
+    with serving(limits=Limits(token="0123456789abcdef")) as guarded:
         reply = guarded.ask("GET", "/docs")
         assert reply.status == 200
         assert guarded.ask("GET", "/openapi.json").status == 401

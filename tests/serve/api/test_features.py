@@ -14,6 +14,8 @@ from serve.api.schemas import Features
 from serve.config import MAX_BODY_BYTES
 from tests.serve.conftest import (
     CARD,
+    JPEG,
+    PNG,
     FakeEngine,
     Served,
     assert_problem,
@@ -23,8 +25,6 @@ from tests.serve.conftest import (
     png,
     until,
 )
-
-JPEG, PNG = jpeg(picture()), png(picture())
 
 
 def test_the_answer_holds_the_engines_outputs(service: Served) -> None:

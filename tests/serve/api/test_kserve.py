@@ -13,20 +13,18 @@ import pytest
 
 from serve.config import Limits
 from tests.serve.conftest import (
+    INFER,
+    JPEG,
     PATIENCE_S,
     FakeEngine,
     Gate,
     Reply,
     Served,
-    jpeg,
-    outputs,
+    constant_engine,
     picture,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
-INFER = "/v2/models/track/infer"
 
 
 def infer(
@@ -64,7 +62,7 @@ def test_not_ready_before_the_model_is_warm() -> None:
     def fail(_engine: Any) -> None:
         raise RuntimeError
 
-    with serving(FakeEngine(lambda _image: outputs()), fail) as service:
+    with serving(constant_engine(), fail) as service:
         assert service.ask("GET", "/v2/health/live").status == 200
         for path in ("/v2/health/ready", "/v2/models/track/ready"):
             assert service.ask("GET", path).status == 503
@@ -234,7 +232,7 @@ def test_every_error_below_v2_has_the_member_error(
 
 
 def test_errors_below_v2_without_a_token_over_the_rate_or_when_full_have_it_too() -> None:
-    engine = FakeEngine(lambda _image: outputs())
+    engine = constant_engine()
     with serving(engine, limits=Limits(token="a-token-of-some-length")) as service:
         reply = service.ask("GET", "/v2")
         assert (reply.status, reply.content["error"]) == (401, reply.content["detail"])

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from serve.config import Limits
-from tests.serve.conftest import PATIENCE_S, FakeEngine, Served, outputs, serving
+from tests.serve.conftest import PATIENCE_S, Served, serving
 
 PATHS = (
     *("/", "/docs", "/console/console.js", "/console/sample-1.jpg", "/openapi.json"),
@@ -47,8 +47,7 @@ def test_requests_after_head_stay_in_step_on_one_connection(service: Served) -> 
 
 def test_head_without_the_token_and_over_the_rate_has_no_body() -> None:
     token = "a-token-of-some-length"
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(token=token)) as service:
+    with serving(limits=Limits(token=token)) as service:
         for path, status in (("/model", 401), ("/v2", 401), ("/", 200), ("/healthz", 200)):
             reply = service.ask("HEAD", path)
             assert (reply.status, reply.content or None) == (status, None)

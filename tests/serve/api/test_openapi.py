@@ -14,7 +14,14 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from serve.app import Service
-from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, png, serving
+from tests.serve.conftest import (
+    Served,
+    constant_engine,
+    jpeg,
+    picture,
+    png,
+    serving,
+)
 
 EXAMPLES = int(os.environ.get("DRIVERVIEW_API_EXAMPLES", "10"))
 
@@ -27,7 +34,7 @@ def bodies(image: bytes) -> st.SearchStrategy[bytes]:
 
 schemathesis.openapi.media_type("image/jpeg", bodies(jpeg(picture())))
 schemathesis.openapi.media_type("image/png", bodies(png(picture())))
-DOCUMENT = Service(FakeEngine(lambda _image: outputs())).framework.openapi()
+DOCUMENT = Service(constant_engine()).framework.openapi()
 schema = schemathesis.openapi.from_dict(DOCUMENT)
 # 503 is correct for a request whose own deadline has passed.
 schema.config.checks.not_a_server_error.expected_statuses = ["2xx", "4xx", "503"]
@@ -37,7 +44,7 @@ schema.config.checks.positive_data_acceptance.expected_statuses = ["2xx", "422",
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[Served]:
-    with serving(FakeEngine(lambda _image: outputs())) as service:
+    with serving() as service:
         yield service
 
 

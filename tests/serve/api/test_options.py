@@ -9,10 +9,9 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tests.serve.conftest import PATIENCE_S, Reply, Served, jpeg, picture
+from tests.serve.conftest import INFER, PATIENCE_S, Reply, Served, jpeg, picture
 
-JPEG, WIDE = jpeg(picture()), jpeg(picture(400, 300))
-INFER = "/v2/models/track/infer"
+WIDE = jpeg(picture(400, 300))
 HEADERS = {
     "frame_id": "X-Frame-Id",
     "stream_id": "X-Stream-Id",

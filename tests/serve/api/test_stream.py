@@ -16,18 +16,14 @@ from serve.api.stream import Stream
 from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
-    FakeEngine,
     Gate,
     Served,
-    jpeg,
-    outputs,
-    picture,
+    constant_engine,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
 
 
 def dial(service: Served, path: str = "/stream", **options: Any) -> ClientConnection:
@@ -96,8 +92,7 @@ def test_a_newer_frame_replaces_a_queued_one_and_late_ones_are_dropped() -> None
 
 
 def test_a_refusal_at_the_handshake() -> None:
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(token="0123456789abcdef")) as service:
+    with serving(limits=Limits(token="0123456789abcdef")) as service:
         token = {"Authorization": "Bearer 0123456789abcdef"}
         for path, headers, status, name in (
             ("/stream", {}, 401, "unauthorized"),
@@ -152,7 +147,7 @@ def test_a_client_that_is_still_sending_receives_the_close_frame(service: Served
 def test_a_long_text_is_not_kept_while_the_websocket_is_idle() -> None:
     """A complete text is no longer counted in the memory budget for bodies."""
     held: list[int] = []
-    service = Service(FakeEngine(lambda _image: outputs()))
+    service = Service(constant_engine())
     messages = iter(({"type": "websocket.connect"}, {"type": "websocket.receive"}))
     scope = {"headers": [], "path": "/stream", "query_string": b"", "subprotocols": []}
 

@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 
 from tests.serve.attacks.conftest import Target, read_head, send_all
-from tests.serve.conftest import jpeg, picture
+from tests.serve.conftest import JPEG
 
 MANY = 256  # the service's largest number of connections
 MB = 1 << 20
-JPEG = jpeg(picture())
 
 Attack = Callable[[Target], list[socket.socket]]
 

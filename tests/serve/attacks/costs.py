@@ -14,9 +14,8 @@ import numpy as np
 
 from tests.serve.attacks.attacks import JPEG, MANY, MB
 from tests.serve.attacks.conftest import BINARY, Target, frame, read_head, send_all
-from tests.serve.conftest import jpeg, picture, png
+from tests.serve.conftest import INFER, jpeg, picture, png
 
-INFER = "/v2/models/track/infer"
 BODY = 4 * MB  # the service's largest body
 ANSWER_S = 10.0  # without an answer for this time, an attacker stops
 

@@ -25,17 +25,13 @@ from tests.serve.attacks.conftest import (
     status_of,
 )
 from tests.serve.conftest import (
-    FakeEngine,
+    JPEG,
     Served,
     jpeg,
-    outputs,
     picture,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
-
 
 MB = 1 << 20
 
@@ -56,8 +52,7 @@ def test_trailers_count_as_headers(service: Served, target: Target, attack: atta
 
 
 def test_trailers_after_a_refusal_are_limited_too() -> None:
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(token=TOKEN)) as service:
+    with serving(limits=Limits(token=TOKEN)) as service:
         (connection,) = attacks.endless_trailers(Target(service.port))
         received = read_rest(connection)
         assert status_of(received) == 401
@@ -66,8 +61,7 @@ def test_trailers_after_a_refusal_are_limited_too() -> None:
 
 def test_trailers_are_dropped() -> None:
     """With and without ASGI, a token or an address in a trailer has no effect."""
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(token=TOKEN)) as service:
+    with serving(limits=Limits(token=TOKEN)) as service:
         target = Target(service.port)
         body = b"%x\r\n%b\r\n0\r\n" % (len(JPEG), JPEG)
         trailers = b"Authorization: Bearer %b\r\nX-Forwarded-For: 10.0.0.1\r\n\r\n"

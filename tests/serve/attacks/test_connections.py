@@ -23,19 +23,15 @@ from tests.serve.attacks.conftest import (
     status_of,
 )
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     Clock,
-    FakeEngine,
     Gate,
     Served,
-    jpeg,
-    outputs,
-    picture,
     serving,
     until,
 )
 
-JPEG = jpeg(picture())
 MB = 1 << 20
 TOKEN = "a-token-of-some-length"
 
@@ -44,8 +40,7 @@ TOKEN = "a-token-of-some-length"
 def test_refused_upgrades_are_answered_and_swept(
     attack: Callable[[Target, int], list[socket.socket]],
 ) -> None:
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(connections=8)) as service:
+    with serving(limits=Limits(connections=8)) as service:
         connections = attack(Target(service.port), 8)
         for connection in connections:
             received = read_rest(connection)
@@ -83,8 +78,7 @@ def test_bytes_sent_with_the_handshake_close_the_connection(target: Target) -> N
 def test_an_answer_that_nobody_reads_has_a_deadline() -> None:
     """Pipelined requests wait until the client reads the earlier replies."""
     clock = Clock()
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(idle_s=30.0), clock=clock) as service:
+    with serving(limits=Limits(idle_s=30.0), clock=clock) as service:
         for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
             service.listener.setsockopt(socket.SOL_SOCKET, option, 1 << 14)
         target = Target(service.port)

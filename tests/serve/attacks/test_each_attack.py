@@ -8,9 +8,8 @@ from tests.serve.attacks import attacks, websockets
 from tests.serve.attacks.conftest import Target, read_rest, resident_mb
 from tests.serve.attacks.costs import REQUESTS, conflicting_lengths
 from tests.serve.attacks.registry import ATTACKS, REPORTED
-from tests.serve.conftest import Served, jpeg, picture, until
+from tests.serve.conftest import JPEG, Served, until
 
-JPEG = jpeg(picture())
 OWN = 20
 OTHERS = (
     *(attacks.pipelined_floods, attacks.refused_floods, websockets.deep_texts),

@@ -19,9 +19,8 @@ from tests.serve.attacks.conftest import (
     read_head,
     send_all,
 )
-from tests.serve.conftest import FakeEngine, jpeg, picture, serving, until
+from tests.serve.conftest import JPEG, FakeEngine, serving, until
 
-JPEG = jpeg(picture())
 MIB = 1 << 20
 
 

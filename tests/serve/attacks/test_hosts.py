@@ -19,17 +19,15 @@ from serve.scheduling.streams import stream_key
 from serve.shared_memory import create_shared_memory
 from serve.workers.worker_process import WorkerTask
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     FakeEngine,
     Served,
     assert_problem,
-    jpeg,
-    picture,
     serving,
 )
 from trackfeatures.errors import UserError
 
-JPEG = jpeg(picture())
 TOKEN = "0123456789abcdef"
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
 PATHS = (("POST", "/features"), ("POST", "/v2/models/track/infer"), ("GET", "/model"), ("GET", "/"))

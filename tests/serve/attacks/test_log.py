@@ -18,17 +18,14 @@ from serve.problems import UNAUTHORIZED, Problem
 from tests.serve.attacks import attacks
 from tests.serve.attacks.conftest import Target, open_count
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     FakeEngine,
     Gate,
     Served,
-    jpeg,
-    picture,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
 
 
 def test_mutated_streams_raise_nothing_and_leave_nothing() -> None:

@@ -16,11 +16,15 @@ from serve.config import MAX_BODY_BYTES
 from serve.server.websocket import SMALL_BYTES
 from tests.serve.attacks.conftest import BINARY, CONTINUATION, Target, frame
 from tests.serve.attacks.loop_time import LOOP_S, least_s, watched
-from tests.serve.conftest import FakeEngine, Served, jpeg, outputs, picture, png, serving
+from tests.serve.conftest import (
+    INFER,
+    JPEG,
+    PNG,
+    Served,
+    serving,
+)
 
 pytestmark = pytest.mark.alone
-JPEG, PNG = jpeg(picture()), png(picture())
-INFER = "/v2/models/track/infer"
 ROOM = MAX_BODY_BYTES - len(JPEG)
 
 
@@ -79,7 +83,7 @@ IMAGES: dict[str, bytes] = {
 @pytest.fixture(scope="module")
 def fast() -> Iterator[Served]:
     """A service with an immediate engine, so that small images are decoded on the event loop."""
-    with serving(FakeEngine(lambda _image: outputs())) as service:
+    with serving() as service:
         for _ in range(12):
             assert service.post(JPEG).status == 200
         yield service

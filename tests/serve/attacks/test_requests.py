@@ -39,6 +39,8 @@ from serve.shared_memory import create_shared_memory
 from tests.serve.attacks.loop_time import LOOP_S, held_s
 from tests.serve.conftest import (
     CARD,
+    INFER,
+    JPEG,
     PATIENCE_S,
     FakeEngine,
     Gate,
@@ -50,9 +52,6 @@ from tests.serve.conftest import (
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
-INFER = "/v2/models/track/infer"
 
 
 def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:

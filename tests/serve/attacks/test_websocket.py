@@ -27,19 +27,15 @@ from tests.serve.attacks.conftest import (
     send_all,
 )
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     Clock,
-    FakeEngine,
     Gate,
     Served,
-    jpeg,
-    outputs,
-    picture,
     serving,
     until,
 )
 
-JPEG = jpeg(picture())
 POLICY, INVALID, TOO_BIG, TRY_LATER = 1008, 1007, 1009, 1013
 
 
@@ -119,9 +115,8 @@ def test_pings_that_nobody_reads_the_answers_of_take_no_memory() -> None:
         now_s += 1.0
         return now_s
 
-    engine = FakeEngine(lambda _image: outputs())
     limits = Limits(head_s=1e9, body_s=1e9, idle_s=1e9)
-    with serving(engine, limits=limits, clock=clock) as service:
+    with serving(limits=limits, clock=clock) as service:
         before = resident_mb()
         (connection,) = websockets.unread_pings(Target(service.port), megabytes=32)
         assert resident_mb() - before < 30
@@ -166,8 +161,7 @@ def test_a_message_and_the_reading_of_answers_have_deadlines() -> None:
 def test_a_handshake_has_a_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     """The application does not answer the handshake; only a fault of the service causes this."""
     clock = Clock()
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, clock=clock) as service:
+    with serving(clock=clock) as service:
 
         async def never(_scope: object, receive: object, _send: object) -> None:
             import asyncio
@@ -211,7 +205,7 @@ def test_a_message_counts_in_the_budget_until_the_service_takes_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     size, taken = 2 << 20, threading.Event()
-    with serving(FakeEngine(lambda _image: outputs())) as service:
+    with serving() as service:
         config = service.server.config  # a ping detects the disconnect of a client that is not read
         config.ws_ping_interval = config.ws_ping_timeout = 0.5
 
@@ -277,8 +271,7 @@ def test_refused_handshakes_write_one_line_a_second_to_the_log(
 
 def test_websockets_without_messages_give_way() -> None:
     clock = Clock()
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(connections=3, idle_s=30.0), clock=clock) as service:
+    with serving(limits=Limits(connections=3, idle_s=30.0), clock=clock) as service:
         target = Target(service.port)
         quiet, busy, other = (target.open_websocket() for _ in range(3))
         clock.now_s += 29.0

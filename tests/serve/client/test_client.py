@@ -17,18 +17,14 @@ from serve.client.aio import AsyncClient
 from serve.config import Limits
 from tests.serve.conftest import (
     CARD,
+    JPEG,
     PATIENCE_S,
+    PNG,
     Clock,
-    FakeEngine,
     Served,
-    jpeg,
-    outputs,
-    picture,
-    png,
+    constant_engine,
     serving,
 )
-
-JPEG, PNG = jpeg(picture()), png(picture())
 
 
 @contextmanager
@@ -66,8 +62,7 @@ def test_a_token_is_sent_as_given_or_as_the_environment_has_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     token = "a-token-of-some-length"
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(token=token)) as service:
+    with serving(limits=Limits(token=token)) as service:
         with Client(service.url) as unknown, pytest.raises(ServiceError, match="token") as refused:
             unknown.features(JPEG)
         assert refused.value.status == 401
@@ -167,7 +162,7 @@ def test_a_refusal_carries_the_problem(service: Served) -> None:
 
 def test_a_wait_that_times_out_raises_the_reason_of_the_service() -> None:
     gate = threading.Event()
-    engine = FakeEngine(lambda _image: outputs())
+    engine = constant_engine()
     with serving(engine, lambda _engine: gate.wait(PATIENCE_S)) as served:
         client = Client(served.url)
         assert not client.ready()
@@ -295,7 +290,7 @@ def test_invalid_addresses(url: str) -> None:
 
 @pytest.mark.parametrize("listens", ["127.0.0.1", "::1"])
 def test_localhost_is_both_loopback_addresses(listens: str) -> None:
-    with serving(FakeEngine(lambda _image: outputs()), host=listens) as service:
+    with serving(host=listens) as service:
         literal = f"[{listens}]" if ":" in listens else listens
         for host in ("localhost", "LOCALHOST", literal):
             with Client(f"http://{host}:{service.port}") as client:
@@ -322,7 +317,7 @@ def test_a_zone_of_an_ipv6_address_is_used_and_ignored_by_the_service(
 
     monkeypatch.setattr(sync, "connect", connect)
     limits = Limits(hosts=("fe80::1%eth0",))
-    with serving(FakeEngine(lambda _image: outputs()), limits=limits, host="::1") as service:
+    with serving(limits=limits, host="::1") as service:
         for zone in ("%25eth0", "%eth0"):
             with Client(f"http://[fe80::1{zone}]:{service.port}") as client:
                 assert client.model()["model"] == CARD.model_hash

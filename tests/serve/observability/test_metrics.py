@@ -14,9 +14,8 @@ from serve.config import Limits
 from serve.observability import logs
 from serve.observability.logs import REFUSALS_PER_S, JsonFormatter
 from serve.problems import PROBLEM_TYPES
-from tests.serve.conftest import Clock, FakeEngine, Served, jpeg, outputs, picture, serving
+from tests.serve.conftest import JPEG, Clock, Served, serving
 
-JPEG = jpeg(picture())
 SAMPLE = re.compile(r'^(driverview_\w+)(\{\w+="[^"]*"(?:,\w+="[^"]*")*\})? (\S+)$')
 
 
@@ -58,8 +57,7 @@ def test_frames_are_counted_by_outcome(service: Served) -> None:
 
 def test_each_worker_reports_the_counts_of_all() -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, shared=memory) as one, serving(engine, shared=memory, block=1) as two:
+    with serving(shared=memory) as one, serving(shared=memory, block=1) as two:
         one.post(JPEG)
         two.post(JPEG)
         two.post(b"")
@@ -104,7 +102,7 @@ def test_refusals_are_logged_with_their_request_and_at_a_limited_rate(
 
 def test_answers_are_logged_on_request(lines: pytest.LogCaptureFixture) -> None:
     limits = Limits(log_answers=True)
-    with serving(FakeEngine(lambda _image: outputs()), limits=limits) as service:
+    with serving(limits=limits) as service:
         service.post(JPEG, X_Request_Id="7")
     (answered,) = (record for record in lines.records if record.getMessage() == "answered")
     content = json.loads(JsonFormatter().format(answered))

@@ -18,10 +18,9 @@ from opentelemetry.trace import SpanKind, StatusCode
 from serve.observability import telemetry
 from tests.serve.api.test_kserve import BASE64, infer
 from tests.serve.api.test_stream import dial, read
-from tests.serve.conftest import FakeEngine, Served, jpeg, picture, serving, until
+from tests.serve.conftest import JPEG, FakeEngine, Served, serving, until
 from trackfeatures.errors import UserError
 
-JPEG = jpeg(picture())
 TRACE, PARENT = "0af7651916cd43dd8448eb211c80319c", "b7ad6b7169203331"
 TRACEPARENT = f"00-{TRACE}-{PARENT}-01"
 STAGES = ["queue", "decode", "forward"]

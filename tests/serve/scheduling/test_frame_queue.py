@@ -19,11 +19,17 @@ from serve.scheduling.frame import Frame, FrameResult
 from serve.scheduling.frame_queue import INLINE_AFTER, FrameQueue
 from serve.scheduling.streams import StreamTable
 from serve.shared_memory import create_shared_memory
-from tests.serve.conftest import PATIENCE_S, FakeEngine, Gate, outputs, picture, until
+from tests.serve.conftest import (
+    PATIENCE_S,
+    Gate,
+    constant_engine,
+    picture,
+    until,
+)
 
 
 def make_engine() -> Engine:
-    return FakeEngine(lambda _image: outputs())
+    return constant_engine()
 
 
 def make_queue(engine: Engine, capacity: int = 0) -> FrameQueue:

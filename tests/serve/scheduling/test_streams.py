@@ -10,20 +10,15 @@ from serve import shared_memory
 from serve.scheduling.streams import EXPIRY_NS, StreamTable, stream_key
 from serve.shared_memory import PROBES
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
-    FakeEngine,
     Gate,
     Reply,
     Served,
     assert_problem,
-    jpeg,
-    outputs,
-    picture,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
 
 
 class Crowd:
@@ -84,7 +79,7 @@ def test_a_newer_frame_at_another_worker_replaces_an_older_one() -> None:
     with busy(gate, memory) as crowd:
         old = crowd.queue(1, X_Stream_Id="front")
         kept = crowd.queue(2, X_Stream_Id="rear")
-        with serving(FakeEngine(lambda _image: outputs()), shared=memory, block=1) as second:
+        with serving(shared=memory, block=1) as second:
             assert second.post(JPEG, X_Stream_Id="front").status == 200
         gate.open.set()
         assert_problem(old.result(), 503, "superseded")

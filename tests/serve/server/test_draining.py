@@ -12,16 +12,13 @@ from websockets.sync.client import connect
 from serve.server import guard, worker_server
 from tests.serve.attacks.conftest import Target, read_head, read_reply
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     FakeEngine,
     Gate,
-    jpeg,
-    picture,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
 
 
 def read_all(connection: socket.socket) -> bytes:

@@ -17,10 +17,12 @@ from serve.scheduling import frame_queue, rate_limit
 from serve.scheduling.frame_queue import INLINE_AFTER, INLINE_MAX_MS
 from serve.server.fast_path import DirectProtocol
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
     Clock,
     FakeEngine,
     Served,
+    constant_engine,
     jpeg,
     outputs,
     picture,
@@ -29,7 +31,6 @@ from tests.serve.conftest import (
     until,
 )
 
-JPEG = jpeg(picture())
 HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
 WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
@@ -210,7 +211,7 @@ def test_a_client_that_reads_no_replies_is_read_no_more(service: Served) -> None
 
 
 def test_a_connection_without_requests_is_closed_after_its_time() -> None:
-    clock, engine = Clock(), FakeEngine(lambda _image: outputs())
+    clock, engine = Clock(), constant_engine()
     with serving(engine, limits=Limits(idle_s=30.0), clock=clock) as service:
         connection = dial(service)
         for _ in range(3):
@@ -235,7 +236,7 @@ def test_requests_of_a_proxy_count_for_the_client_it_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(rate_limit, "time", SimpleNamespace(monotonic=Clock()))
-    with serving(FakeEngine(lambda _image: outputs()), limits=Limits(rate=2.0)) as service:
+    with serving(limits=Limits(rate=2.0)) as service:
         for _ in range(9):
             assert service.post(JPEG).status == 200  # this machine has no limit
         statuses = [service.post(JPEG, X_Forwarded_For="10.1.2.3").status for _ in range(3)]

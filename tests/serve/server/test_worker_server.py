@@ -11,18 +11,14 @@ from serve.server import worker_server
 from serve.server.worker_server import WorkerServer
 from serve.shared_memory import WorkerPeers
 from tests.serve.conftest import (
+    JPEG,
     PATIENCE_S,
-    FakeEngine,
     Served,
     assert_problem,
-    jpeg,
-    outputs,
-    picture,
+    constant_engine,
     serving,
     until,
 )
-
-JPEG = jpeg(picture())
 
 
 def make_clients(port: int) -> list[Served]:
@@ -38,7 +34,7 @@ def test_a_worker_that_warms_up_leaves_connections_to_one_that_is_ready(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
-    ours, others = FakeEngine(lambda _image: outputs()), FakeEngine(lambda _image: outputs())
+    ours, others = constant_engine(), constant_engine()
     warm = threading.Event()
     with (
         serving(ours, shared=memory) as one,
@@ -61,7 +57,7 @@ def test_a_worker_that_warms_up_leaves_connections_to_one_that_is_ready(
 
 def test_while_no_worker_is_ready_requests_are_refused() -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
-    engine = FakeEngine(lambda _image: outputs())
+    engine = constant_engine()
     warm = threading.Event()
     with (
         serving(engine, lambda _engine: warm.wait(PATIENCE_S), shared=memory) as one,
@@ -75,12 +71,11 @@ def test_a_worker_with_the_most_connections_ends_idle_ones_for_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
-    engine = FakeEngine(lambda _image: outputs())
     limits = Limits(connections=4)
-    with serving(engine, limits=limits, shared=memory) as one:
+    with serving(limits=limits, shared=memory) as one:
         idle = [Served(one.port) for _ in range(4)]
         assert ask_each(idle) == [200] * 4
-        with serving(engine, limits=limits, shared=memory, block=1, beside=one) as two:
+        with serving(limits=limits, shared=memory, block=1, beside=one) as two:
             until(lambda: WorkerPeers(memory, 1).other_connections() == [4])
             monkeypatch.setattr(worker_server, "YIELD_S", PATIENCE_S)  # worker one yields to two
             refused = Served(two.port).post(JPEG)  # two accepts it, and has no connection to end
@@ -92,8 +87,7 @@ def test_a_worker_with_the_most_connections_ends_idle_ones_for_another(
 
 def test_refused_clients_end_one_idle_connection_at_a_time() -> None:
     memory = shared_memory.create_shared_memory(blocks=2)
-    engine = FakeEngine(lambda _image: outputs())
-    with serving(engine, limits=Limits(connections=4), shared=memory) as one:
+    with serving(limits=Limits(connections=4), shared=memory) as one:
         idle = [Served(one.port) for _ in range(4)]
         assert ask_each(idle) == [200] * 4
         other = WorkerPeers(memory, 1)
@@ -133,7 +127,7 @@ def test_many_connections_at_once_are_accepted_one_after_the_other(
     monkeypatch.setattr(WorkerServer, "_pause_accepting", pause)
     monkeypatch.setattr(worker_server, "ACCEPTS_AT_ONCE", 4)
     monkeypatch.setattr(worker_server, "ACCEPTS_PER_S", 100)
-    with serving(FakeEngine(lambda _image: outputs())) as service:
+    with serving() as service:
         begin = time.monotonic()
         clients = [Served(service.port) for _ in range(24)]
         assert ask_each(clients) == [200] * 24

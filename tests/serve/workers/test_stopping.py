@@ -16,10 +16,8 @@ import pytest
 
 from serve.client import Client
 from serve.workers.control_socket import send_command
-from tests.serve.conftest import PATIENCE_S, jpeg, picture
+from tests.serve.conftest import JPEG, PATIENCE_S
 from tests.serve.test_cli import ROOT, address, command, started
-
-JPEG = jpeg(picture())
 
 
 class Clients:
