@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -209,6 +210,10 @@ class Served:
         """The application of this server."""
         return self.server.app
 
+    def close(self) -> None:
+        """Close the connection; the next request opens a new one."""
+        self._connection.close()
+
     def received_bytes(self) -> list[int]:
         """The number of received bytes of each incomplete request, in ascending order."""
         receiving = list(self.server.guard.receiving)
@@ -266,30 +271,39 @@ def serving(
     its connections. `host` is the address to listen on, `cameras` the named cameras.
     """
 
-    def checked(engine: Engine) -> None:
-        if check is not None:
-            check(engine)
-
     listener = beside.listener.dup() if beside is not None else bind(host, 0)
     listener.listen(2048)
-    app = Service(
-        engine or constant_engine(), checked, limits, shared, block, tracer, cameras or {}
-    )
+    parts = (limits, shared, block, tracer, cameras or {})
+    app = Service(engine or constant_engine(), check or (lambda _engine: None), *parts)
     server = WorkerServer(app, limits or Limits(), WorkerPeers(app.shared, block))
     if clock is not None:
         server.guard.clock = clock
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
+    served = Served(listener.getsockname()[1], server, listener)
     try:
         until(lambda: server.started or not thread.is_alive())
         assert server.started
         if check is None:
             until(lambda: app.frame_queue.ready)
-        yield Served(listener.getsockname()[1], server, listener)
+        yield served
     finally:
+        served.close()  # the server would wait for another request on this connection
         server.should_exit = True
         thread.join()
         listener.close()
+
+
+@contextmanager
+def busy(**options: Any) -> Iterator[tuple[Served, Gate]]:
+    """A service, made with `options`, whose engine works on an image until its gate is opened."""
+    gate = Gate()
+    with serving(gate.engine, **options) as served, ThreadPoolExecutor(1) as pool:
+        first = pool.submit(Served(served.port).post, JPEG)
+        assert gate.busy.wait(PATIENCE_S)
+        yield served, gate
+        gate.open.set()
+        assert first.result().status == 200
 
 
 @pytest.fixture

@@ -3,9 +3,8 @@
 import json
 import select
 import socket
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -14,6 +13,7 @@ from serve.config import Limits, is_loopback
 from serve.problems import Problem
 from serve.scheduling.rate_limit import RateLimiter
 from serve.server.guard import EVICTABLE_S, ConnectionGuard, Group
+from tests.serve.attacks.conftest import read_rest
 from tests.serve.conftest import (
     JPEG,
     PATIENCE_S,
@@ -21,17 +21,13 @@ from tests.serve.conftest import (
     Gate,
     Served,
     assert_problem,
+    busy,
     serving,
     until,
 )
 
 HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
-
-
-def limited(
-    limits: Limits, clock: Callable[[], float] | None = None
-) -> AbstractContextManager[Served]:
-    return serving(limits=limits, clock=clock)
+WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
 
 def dial(service: Served, source: str = "127.0.0.1") -> socket.socket:
@@ -40,11 +36,8 @@ def dial(service: Served, source: str = "127.0.0.1") -> socket.socket:
 
 def read_refusal(connection: socket.socket) -> tuple[int, dict[str, object]]:
     """The status and the problem in the reply with which the service ends a connection."""
-    received = b""
     with connection:
-        while part := connection.recv(65536):
-            received += part
-    head, _, body = received.partition(b"\r\n\r\n")
+        head, _, body = read_rest(connection).partition(b"\r\n\r\n")
     assert b"connection: close" in head
     return int(head.split()[1]), json.loads(body)
 
@@ -59,7 +52,7 @@ def is_cut(connection: socket.socket) -> bool:
 
 def test_slow_headers_slow_bodies_and_silent_connections_are_closed() -> None:
     clock = Clock()
-    with limited(Limits(head_s=5.0, body_s=10.0, idle_s=30.0), clock) as service:
+    with serving(limits=Limits(head_s=5.0, body_s=10.0, idle_s=30.0), clock=clock) as service:
         slow_head, slow_body, silent = dial(service), dial(service), dial(service)
         begun = HEAD + b"Content-Length: 1000\r\n\r\n" + JPEG[:10]
         slow_head.sendall(HEAD)
@@ -91,7 +84,7 @@ def assert_too_slow(connection: socket.socket, part: str) -> None:
 
 def test_single_bytes_do_not_extend_the_time_for_headers() -> None:
     clock, begun = Clock(), HEAD + b"X-Slow: "
-    with limited(Limits(head_s=5.0), clock) as service:
+    with serving(limits=Limits(head_s=5.0), clock=clock) as service:
         connection = dial(service)
         connection.sendall(begun)
         for count in range(4):
@@ -110,7 +103,7 @@ def filled(count: int) -> Iterator[tuple[Served, list[socket.socket]]]:
     with serving(gate.engine, limits=Limits(connections=count, queue=count)) as service:
         connections = [dial(service) for _ in range(count)]
         for connection in connections:
-            connection.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
+            connection.sendall(WHOLE)
         until(lambda: len(service.server.guard.working) == count)
         try:
             yield service, connections
@@ -129,9 +122,9 @@ def test_one_connection_too_many_is_refused_until_another_is_closed() -> None:
 
 
 def test_idle_connections_give_way_to_new_ones_longest_idle_first_served_clients_last() -> None:
-    with limited(Limits(connections=4)) as service:
+    with serving(limits=Limits(connections=4)) as service:
         served, *idle = connections = [dial(service) for _ in range(4)]
-        served.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
+        served.sendall(WHOLE)
         assert served.recv(65536).startswith(b"HTTP/1.1 200")
         for connection in (*idle, idle[0]):
             connection.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -150,13 +143,13 @@ def test_idle_connections_give_way_to_new_ones_longest_idle_first_served_clients
             )
             until(lambda: len(service.server.guard.receiving) == len(new))  # not idle
             assert len(service.server.server_state.connections) <= 5
-        served.sendall(HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG)
+        served.sendall(WHOLE)
         assert served.recv(65536).startswith(b"HTTP/1.1 200")
 
 
 def test_connections_without_a_request_give_way_to_new_ones() -> None:
     clock = Clock()
-    with limited(Limits(connections=4), clock) as service:
+    with serving(limits=Limits(connections=4), clock=clock) as service:
         silent = [dial(service) for _ in range(4)]
         service.wait_received(0, 0, 0, 0)
         clock.now_s += 1.01 * EVICTABLE_S
@@ -166,19 +159,18 @@ def test_connections_without_a_request_give_way_to_new_ones() -> None:
 
 def test_a_client_with_many_connections_gives_way_to_one_with_few() -> None:
     clock = Clock()
-    whole = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
-    with limited(Limits(connections=8), clock) as service:
+    with serving(limits=Limits(connections=8), clock=clock) as service:
         steady = dial(service)
-        steady.sendall(whole)
+        steady.sendall(WHOLE)
         assert steady.recv(65536).startswith(b"HTTP/1.1 200")
         many = [dial(service, "127.0.0.2") for _ in range(7)]
         service.wait_received(*[0] * 7)
         assert read_refusal(dial(service, "127.0.0.2"))[0] == 503  # all are too young
-        steady.sendall(whole)
+        steady.sendall(WHOLE)
         assert steady.recv(65536).startswith(b"HTTP/1.1 200")
         others = [dial(service) for _ in range(2)]  # one replaces the refused connection
         for other in others:
-            other.sendall(whole)
+            other.sendall(WHOLE)
             assert other.recv(65536).startswith(b"HTTP/1.1 200")
         ended, _, _ = select.select(many, [], [], PATIENCE_S)
         assert [is_cut(connection) for connection in ended] == [True]
@@ -223,11 +215,10 @@ class Connection:
 
 def test_slow_requests_give_way_to_new_connections_but_served_clients_stay() -> None:
     clock = Clock()
-    whole = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
     begun = HEAD + b"Content-Length: 1000\r\n\r\n" + JPEG[:10]
-    with limited(Limits(connections=4), clock) as service:
+    with serving(limits=Limits(connections=4), clock=clock) as service:
         steady = dial(service)
-        steady.sendall(whole)
+        steady.sendall(WHOLE)
         assert steady.recv(65536).startswith(b"HTTP/1.1 200")
         slow = [dial(service) for _ in range(3)]
         for connection, part in zip(slow, (begun, HEAD, HEAD), strict=True):
@@ -237,7 +228,7 @@ def test_slow_requests_give_way_to_new_connections_but_served_clients_stay() -> 
         assert service.post(JPEG).status == 200
         ended, _, _ = select.select(slow, [], [], PATIENCE_S)
         assert [is_cut(connection) for connection in ended] == [True]
-        steady.sendall(whole)
+        steady.sendall(WHOLE)
         assert steady.recv(65536).startswith(b"HTTP/1.1 200")
 
 
@@ -272,7 +263,7 @@ def test_bytes_that_are_no_http_are_answered_with_a_problem(service: Served) -> 
 
 def test_requests_without_the_token_are_refused() -> None:
     token = "a-token-of-some-length"
-    with limited(Limits(token=token)) as service:
+    with serving(limits=Limits(token=token)) as service:
         for sent in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": f"Basic {token}"}):
             for method, path in (
                 ("POST", "/features"),
@@ -324,13 +315,9 @@ def test_loopback_addresses() -> None:
 
 def test_a_client_refused_by_a_full_queue_is_paused_and_then_read_again() -> None:
     """While the queue is full, the client's next request waits a moment; other clients do not."""
-    gate = Gate()
-    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
-        first = pool.submit(Served(service.port).post, JPEG)
-        until(gate.busy.is_set)
+    with busy(limits=Limits(queue=0)) as (service, gate):
         for _ in range(20):
             assert_problem(service.post(JPEG), 503, "overloaded")
         assert service.ask("GET", "/healthz").status == 200
         gate.open.set()
-        assert first.result().status == 200
         until(lambda: service.post(JPEG).status == 200)

@@ -89,8 +89,6 @@ def test_a_wider_view_is_cropped_and_the_answer_gives_the_crop(
     reply = service.post(JPEG, X_Camera_Fov_Y="90")
     assert reply.content["crop_px"] == [46, 35, 187, 140]
     assert_problem(service.post(JPEG, X_Camera_Fov_Y="60"), 422, "field-of-view")
-    for text in ("nan", "0", "180", "wide", "1e999", ""):
-        assert_problem(service.post(JPEG, X_Camera_Fov_Y=text), 422, "invalid-request")
 
 
 def test_every_answer_has_a_request_id(service: Served) -> None:

@@ -1,11 +1,10 @@
 """HEAD is answered like GET, without the body; methods that are not allowed get 405 and Allow."""
 
-import socket
-
 import pytest
 
 from serve.config import Limits
-from tests.serve.conftest import PATIENCE_S, Served, serving
+from tests.serve.attacks.conftest import Target, read_rest
+from tests.serve.conftest import Served, serving
 
 PATHS = (
     *("/", "/docs", "/console/console.js", "/console/sample-1.jpg", "/openapi.json"),
@@ -33,11 +32,9 @@ def test_head_is_get_without_the_body(service: Served, path: str) -> None:
 def test_requests_after_head_stay_in_step_on_one_connection(service: Served) -> None:
     lines = [f"{m} {p} HTTP/1.1\r\nHost: localhost\r\n" for m, p in (("HEAD", "/"), ("HEAD", "/x"))]
     last = "GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
-    with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
+    with Target(service.port).dial() as connection:
         connection.sendall("\r\n".join([*lines, last, ""]).encode())
-        received = b""
-        while part := connection.recv(1 << 16):
-            received += part
+        received = read_rest(connection)
     first, second, third = received.split(b"HTTP/1.1 ")[1:]
     assert (first[:3], second[:3], third[:3]) == (b"200", b"404", b"200")
     assert first.endswith(b"\r\n\r\n")

@@ -18,9 +18,9 @@ from serve.scheduling.rate_limit import RateLimiter, client_key
 from serve.scheduling.streams import stream_key
 from serve.shared_memory import create_shared_memory
 from serve.workers.worker_process import WorkerTask
+from tests.serve.attacks.conftest import Target, read_rest, status_of
 from tests.serve.conftest import (
     JPEG,
-    PATIENCE_S,
     FakeEngine,
     Served,
     assert_problem,
@@ -41,13 +41,11 @@ def guarded(engine: FakeEngine) -> Iterator[Served]:
 
 def raw(service: Served, request: bytes) -> tuple[int, bytes]:
     """The status and the body of the answer to the bytes of a request without a body."""
-    with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
+    with Target(service.port).dial() as connection:
         connection.sendall(request)
         connection.shutdown(socket.SHUT_WR)
-        received = b""
-        while part := connection.recv(65536):
-            received += part
-    return int(received.split()[1]), received.partition(b"\r\n\r\n")[2]
+        received = read_rest(connection)
+    return status_of(received), received.partition(b"\r\n\r\n")[2]
 
 
 @pytest.mark.parametrize(("method", "path"), PATHS)

@@ -36,6 +36,7 @@ from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, Admission
 from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.scheduling.fair_queue import PRESENT_NS, FairQueue
 from serve.shared_memory import create_shared_memory
+from tests.serve.attacks.conftest import Target
 from tests.serve.attacks.loop_time import LOOP_S, held_s
 from tests.serve.conftest import (
     CARD,
@@ -46,6 +47,7 @@ from tests.serve.conftest import (
     Gate,
     Served,
     assert_problem,
+    busy,
     jpeg,
     picture,
     png,
@@ -140,16 +142,10 @@ def test_scans_times_pixels_are_limited() -> None:
 
 
 def test_a_full_queue_reads_no_inference_request() -> None:
-    gate = Gate()
-    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
-        first = pool.submit(Served(service.port).post, JPEG)
-        until(gate.busy.is_set)
-        with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
-            head = f"POST {INFER} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n"
-            connection.sendall(head.encode())  # the body is not sent
-            assert connection.recv(65536).startswith(b"HTTP/1.1 503")
-        gate.open.set()
-        assert first.result().status == 200
+    with busy(limits=Limits(queue=0)) as (service, _), Target(service.port).dial() as connection:
+        # The body is not sent.
+        connection.sendall(Target(service.port).post(b"", INFER, Content_Length="1000000"))
+        assert connection.recv(65536).startswith(b"HTTP/1.1 503")
 
 
 LARGE = png(np.zeros((2048, 4096, 4), np.uint16), cv2.IMWRITE_PNG_COMPRESSION, 9)
@@ -229,26 +225,21 @@ def test_the_shares_of_many_addresses_are_bounded() -> None:
 
 
 def test_a_refused_image_of_a_stream_gives_its_admission_back() -> None:
-    gate = Gate()
-    with serving(gate.engine, limits=Limits(queue=0)) as service, ThreadPoolExecutor(1) as pool:
-        first = pool.submit(Served(service.port).post, JPEG)
-        until(gate.busy.is_set)
+    with busy(limits=Limits(queue=0)) as (service, gate):
         sent = {"X_Stream_Id": "cam", "X_Camera_Fov_Y": "90"}
         for _ in range(3):
             reply = service.post(LARGE, "image/png", **sent)
             assert_problem(reply, 503, "overloaded")
             assert "frames are waiting" in reply.content["detail"]
         gate.open.set()
-        first.result()
         until(lambda: service.post(LARGE, "image/png", **sent).status == 200)
 
 
 def begin(service: Served, size: int, path: str = "/features") -> socket.socket:
     """A connection on which `size` bytes of a body of the largest size were sent."""
-    connection = socket.create_connection(("127.0.0.1", service.port), PATIENCE_S)
-    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
-    connection.sendall(f"{head}Content-Length: {MAX_BODY_BYTES}\r\n\r\n".encode())
-    connection.sendall(b"\0" * size)
+    target = Target(service.port)
+    connection = target.dial()
+    connection.sendall(target.post(bytes(size), path, Content_Length=str(MAX_BODY_BYTES)))
     return connection
 
 

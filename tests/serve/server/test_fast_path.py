@@ -1,7 +1,6 @@
 """POST /features without ASGI: the engine's thread, the order of replies, bodies."""
 
 import contextlib
-import json
 import socket
 import threading
 import time
@@ -16,6 +15,7 @@ from serve.config import MAX_BODY_BYTES, Limits
 from serve.scheduling import frame_queue, rate_limit
 from serve.scheduling.frame_queue import INLINE_AFTER, INLINE_MAX_MS
 from serve.server.fast_path import DirectProtocol
+from tests.serve.attacks.conftest import read_reply, read_rest
 from tests.serve.conftest import (
     JPEG,
     PATIENCE_S,
@@ -64,19 +64,7 @@ class RecordingEngine(FakeEngine):
 
 def read(connection: socket.socket, count: int) -> list[tuple[int, dict[str, Any]]]:
     """The status and content of the next `count` replies."""
-    found: list[tuple[int, dict[str, Any]]] = []
-    received = b""
-    while len(found) < count:
-        head, end, rest = received.partition(b"\r\n\r\n")
-        length = int(head.lower().partition(b"content-length: ")[2].split(b"\r\n")[0]) if end else 0
-        if end and len(rest) >= length:
-            found.append((int(head.split()[1]), json.loads(rest[:length])))
-            received = rest[length:]
-            continue
-        part = connection.recv(65536)
-        assert part
-        received += part
-    return found
+    return [read_reply(connection) for _ in range(count)]
 
 
 def dial(service: Served) -> socket.socket:
@@ -167,10 +155,7 @@ def test_a_body_may_arrive_in_parts_and_in_chunks(service: Served) -> None:
 def test_a_reply_says_that_the_connection_will_be_closed(service: Served) -> None:
     connection = dial(service)
     connection.sendall(WHOLE.replace(b"Host", b"Connection: close\r\nHost", 1))
-    received = b""
-    while part := connection.recv(65536):
-        received += part
-    head = received.partition(b"\r\n\r\n")[0].lower()
+    head = read_rest(connection).partition(b"\r\n\r\n")[0].lower()
     assert head.startswith(b"http/1.1 200 ok\r\n")
     for name in (b"date", b"x-request-id", b"content-type", b"content-length", b"connection"):
         assert head.count(b"\r\n%b: " % name) == 1
