@@ -36,8 +36,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.claims.outcome import exit_code, run_command
 from benchmarks.service_load.malicious_clients import ADDRESS
 from benchmarks.service_load.servers import descendants
+from runtime.access import TOKEN_VARIABLE, is_loopback
 from runtime.sockets import bind
-from serve.config import TOKEN_VARIABLE, is_loopback
 from tests.serve.attacks.attacks import JPEG, Attack
 from tests.serve.attacks.conftest import Target, resident_mb
 from tests.serve.attacks.registry import ATTACKS

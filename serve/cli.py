@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from runtime import cli as command
-from serve.config import Limits, ServiceConfig, check_exposure, check_proxies, read_token
+from runtime.access import check_exposure, read_token
+from serve.config import Limits, ServiceConfig, check_proxies
 from trackfeatures.errors import UserError
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich")

@@ -5,10 +5,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from ipaddress import IPv6Address, ip_address, ip_network
 
-from runtime.access import TOKEN_VARIABLE as TOKEN_VARIABLE
-from runtime.access import check_exposure as check_exposure
-from runtime.access import is_loopback as is_loopback
-from runtime.access import read_token as read_token
 from trackfeatures.errors import UserError
 
 MAX_BODY_BYTES = 4 << 20

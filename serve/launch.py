@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 
 from mtlnet.inference.model_card import read_card, resolve_run
+from runtime.access import check_exposure
 from runtime.sockets import address, bind_all, shown_addresses
-from serve.config import ServiceConfig, check_exposure
+from serve.config import ServiceConfig
 from serve.observability import logs, telemetry
 from serve.workers.control_socket import listen_for_commands, socket_path
 from serve.workers.supervisor import ServicePlan, Supervisor

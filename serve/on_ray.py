@@ -22,9 +22,10 @@ from ray import serve as ray_serve  # not to be confused with this package, `ser
 
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
+from runtime.access import read_token
 from runtime.cli import counted
 from serve.app import Service
-from serve.config import Limits, ServiceConfig, read_token
+from serve.config import Limits, ServiceConfig
 from serve.observability import telemetry
 from serve.scheduling.warmup import warm_up
 from trackfeatures.errors import UserError

@@ -21,11 +21,7 @@ from serve.app import Service
 from serve.observability import logs, telemetry
 from serve.scheduling.warmup import warm_up
 from serve.server.worker_server import WorkerServer
-from serve.shared_memory import (
-    COMMITTED_GENERATION,
-    WorkerPeers,
-    attach_shared_memory,
-)
+from serve.shared_memory import COMMITTED_GENERATION, WorkerPeers, attach_shared_memory
 from serve.workers.worker_process import WorkerTask
 from trackfeatures.errors import UserError
 

@@ -37,12 +37,7 @@ from serve.api.request_options import (
     request_id_of,
 )
 from serve.asgi import Message, Receive, Scope, Send, client_address, send_reply
-from serve.problems import (
-    INVALID_REQUEST,
-    NOT_FOUND,
-    Problem,
-    internal_error,
-)
+from serve.problems import INVALID_REQUEST, NOT_FOUND, Problem, internal_error
 from serve.replies import problem_reply
 from serve.scheduling.rate_limit import RateLimiter
 

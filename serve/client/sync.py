@@ -15,8 +15,9 @@ import time
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
+from runtime.access import TOKEN_VARIABLE
 from runtime.sockets import connect
-from serve.config import MAX_DEADLINE_MS, TOKEN_VARIABLE
+from serve.config import MAX_DEADLINE_MS
 from trackfeatures.errors import UserError
 
 RETRY_S = 0.1

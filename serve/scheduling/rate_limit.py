@@ -8,8 +8,8 @@ import time
 from functools import lru_cache
 from hashlib import blake2b
 
-from serve.config import is_loopback
-from serve.config import network_of as network_of
+from runtime.access import is_loopback
+from serve.config import network_of
 from serve.problems import RATE_LIMITED, Problem
 from serve.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 

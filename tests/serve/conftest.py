@@ -4,10 +4,10 @@ Tests wait for events, never for a fixed time, and at most `PATIENCE_S`, which i
 busy machine. Tests of time limits set the service's clock (`Clock`).
 """
 
-import gc
 import http.client
 import json
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -110,6 +110,15 @@ def png(image: NDArray[Any], *options: int) -> bytes:
 
 JPEG, PNG = jpeg(picture()), png(picture())
 INFER = "/v2/models/track/infer"
+
+
+def tensor_request(image: bytes, **more: Any) -> tuple[dict[str, str], bytes]:
+    """The header and the body of an inference request with an image file as binary data."""
+    raw = struct.pack("<I", len(image)) + image
+    tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
+    tensor |= {"parameters": {"binary_data_size": len(raw)}}
+    head = json.dumps({"inputs": [tensor], **more}).encode()
+    return {"Inference-Header-Content-Length": str(len(head))}, head + raw
 
 
 def constant_engine() -> FakeEngine:
@@ -331,19 +340,3 @@ def publish_untrained(run: Path, seed: int) -> None:
 
     torch.manual_seed(seed)
     publish(Network(), run, golden_image(280, 210)[None])
-
-
-def types_in_cycles(work: Callable[[], object]) -> list[type]:
-    """The types of the objects that `work` leaves in reference cycles. They stay in memory until a
-    garbage collection, which would delay all clients."""
-    gc.collect()
-    gc.disable()
-    gc.set_debug(gc.DEBUG_SAVEALL)
-    try:
-        work()
-        gc.collect()
-        return [type(found) for found in gc.garbage]
-    finally:
-        gc.set_debug(0)
-        gc.garbage.clear()
-        gc.enable()

@@ -28,11 +28,8 @@ from tests.serve.conftest import (
 )
 
 
-def test_errors_of_the_framework_are_problems(service: Served) -> None:
+def test_a_path_without_a_page_is_a_problem(service: Served) -> None:
     assert_problem(service.ask("GET", "/nothing"), 404, "not-found")
-    reply = service.ask("GET", "/features")
-    assert_problem(reply, 405, "method-not-allowed")
-    assert reply.headers["allow"] == "POST"
 
 
 def test_a_service_is_alive_at_once_and_ready_once_its_model_is_warm() -> None:
@@ -108,14 +105,10 @@ def test_frames_that_do_not_fit_into_the_queue_are_refused_at_once(
     assert service.post(JPEG).status == 200
 
 
-def test_the_model_card_the_console_and_the_documentation_are_served(service: Served) -> None:
+def test_the_model_card_is_served(service: Served) -> None:
     model = service.ask("GET", "/model").content
     assert model["model"] == CARD.model_hash
     assert model["camera"]["fov_y_deg"] == 67.5
-    page = service.ask("GET", "/")
-    assert page.status == 200
-    assert b"/features" in page.content
-    assert service.ask("GET", "/docs").status == 200
 
 
 def test_the_service_imports_neither_torch_nor_physics() -> None:

@@ -8,8 +8,9 @@ from contextlib import contextmanager
 
 import pytest
 
+from runtime.access import is_loopback
 from serve import shared_memory
-from serve.config import Limits, is_loopback
+from serve.config import Limits
 from serve.problems import Problem
 from serve.scheduling.rate_limit import RateLimiter
 from serve.server.guard import EVICTABLE_S, ConnectionGuard, Group

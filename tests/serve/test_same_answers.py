@@ -3,7 +3,6 @@
 import base64
 import http.client
 import json
-import struct
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +20,17 @@ from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from serve.scheduling.warmup import TOLERANCE, warm_up
 from serve.shared_memory import create_shared_memory
-from tests.serve.conftest import INFER, JPEG, PATIENCE_S, Served, jpeg, picture, serving, until
+from tests.serve.conftest import (
+    INFER,
+    JPEG,
+    PATIENCE_S,
+    Served,
+    jpeg,
+    picture,
+    serving,
+    tensor_request,
+    until,
+)
 from trackfeatures.camera import CameraParameters
 
 FEATURES = (
@@ -65,15 +74,8 @@ def by_tensors(connection: Connection) -> dict[str, Any]:
 
 
 def by_raw_tensors(connection: Connection) -> dict[str, Any]:
-    raw = struct.pack("<I", len(JPEG)) + JPEG
-    tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
-    request = {
-        "inputs": [{**tensor, "parameters": {"binary_data_size": len(raw)}}],
-        "parameters": {"binary_data_output": True},
-    }
-    head = json.dumps(request).encode()
-    length = {"Inference_Header_Content_Length": str(len(head))}
-    content, end = post(connection, INFER, head + raw, **length)
+    headers, body = tensor_request(JPEG, parameters={"binary_data_output": True})
+    content, end = post(connection, INFER, body, **headers)
     answer = json.loads(content[:end])
     found = {}
     for output in answer["outputs"]:

@@ -15,15 +15,7 @@ from serve.client import Client, ServiceError
 from serve.config import Limits
 from serve.workers.worker_process import WorkerTask
 from tests.serve.api.test_options import JPEG, WIDE, features, infer, post, stream
-from tests.serve.conftest import (
-    CARD,
-    PATIENCE_S,
-    FakeEngine,
-    Served,
-    constant_engine,
-    outputs,
-    serving,
-)
+from tests.serve.conftest import CARD, PATIENCE_S, FakeEngine, Served, outputs, serving
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -33,11 +25,6 @@ ROOF = CameraParameters(
 )  # fmt: skip
 MODEL = CARD.camera
 EXPECTED = decode_outputs(Rectification(ROOF, MODEL).outputs(outputs()[None])[0])
-
-
-@pytest.fixture
-def engine() -> FakeEngine:
-    return constant_engine()
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -139,47 +140,50 @@ def test_a_film_is_answered_while_it_plays(
     assert text.startswith("the browser cannot play this film: ")
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+
+
+def node(folder: Path, module: str, names: str, script: str) -> Any:
+    """The value of the last expression of `script`, which imports `names` from a file of the
+    console."""
+    file = folder / "ask.mjs"
+    file.write_text(
+        f"import {{ {names} }} from '{(FOLDER / module).as_uri()}';\n"
+        f"const found = {script};\nconsole.log(JSON.stringify(found));\n"
+    )
+    done = subprocess.run(["node", str(file)], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+@needs_node
 def test_a_marking_is_absent_where_the_service_says_so(tmp_path: Path) -> None:
     """`l` is present up to a probability of absence of 0.75."""
     answer = {
         "distances_m": {"ml": None, "l": -3.5},
         "absent": {"ml": 0.9, "l": 0.7},
     }
-    script = tmp_path / "absent.mjs"
-    module = (FOLDER / "drawing.js").as_uri()
-    script.write_text(
-        f"import {{ absence }} from '{module}';\n"
-        f"const answer = {json.dumps(answer)};\n"
-        "const coded = { ...answer, absent: null };\n"
-        "console.log(JSON.stringify([absence(answer, 'ml'), absence(answer, 'l'),"
-        " absence(answer, 'angle'), absence(coded, 'ml')]));\n"
-    )
-    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout) == ["absent, 90 %", None, None, None]
+    coded = {**answer, "absent": None}
+    asked = [(answer, "ml"), (answer, "l"), (answer, "angle"), (coded, "ml")]
+    script = f"{json.dumps(asked)}.map((each) => absence(...each))"
+    found = node(tmp_path, "drawing.js", "absence", script)
+    assert found == ["absent, 90 %", None, None, None]
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+@needs_node
 def test_console_geometry_equals_the_pinhole_camera(tmp_path: Path) -> None:
     """A point on a marking is drawn where the camera matrix projects it: 2 m right, 5 m ahead."""
-    script = tmp_path / "ask.mjs"
-    module = (FOLDER / "geometry.js").as_uri()
-    camera = CameraParameters()
-    script.write_text(
-        f"import {{ onMarking, project }} from '{module}';\n"
-        f"const camera = {json.dumps(asdict(camera))};\n"
-        "console.log(JSON.stringify([project(onMarking(2, 0, 5.75), camera),"
-        " onMarking(2, 0.1, 0), onMarking(0, 0.1, 10)]));\n"
+    camera = json.dumps(asdict(CameraParameters()))
+    script = (
+        f"[project(onMarking(2, 0, 5.75), {camera}), onMarking(2, 0.1, 0), onMarking(0, 0.1, 10)]"
     )
-    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
-    pixel, beside, ahead = json.loads(done.stdout)
+    pixel, beside, ahead = node(tmp_path, "geometry.js", "onMarking, project", script)
     focal = 105 / math.tan(math.radians(67.5) / 2)
     assert pixel == pytest.approx([140 + focal * 2 / 5, 105 + focal * 1.2 / 5])
     assert beside == pytest.approx([2 * math.sin(0.1), -2 * math.cos(0.1)])
     assert ahead == pytest.approx([10 * math.cos(0.1), 10 * math.sin(0.1)])
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+@needs_node
 def test_console_geometry_equals_the_projection_of_any_camera(tmp_path: Path) -> None:
     mount = {"x": 1.2, "y": 0.1, "z": 1.1, "pitch_deg": 5.0, "roll_deg": 3.0, "yaw_deg": -4.0}
     matrix = (700.0, 720.0, 655.0, 340.0)
@@ -195,17 +199,13 @@ def test_console_geometry_equals_the_projection_of_any_camera(tmp_path: Path) ->
         for kind, k in lenses
     ]
     places = [(4.0, -2.5), (8.0, 1.5), (30.0, -4.0), (-3.0, 0.0), (2.4, 2.4)]
-    script = tmp_path / "ask.mjs"
-    script.write_text(
-        f"import {{ project }} from '{(FOLDER / 'geometry.js').as_uri()}';\n"
-        f"const cameras = {json.dumps([camera.as_dict() for camera in cameras])};\n"
-        f"const places = {json.dumps(places)};\n"
-        "const found = cameras.map((camera) => places.map((place) => project(place, camera)));\n"
-        "console.log(JSON.stringify(found));\n"
+    script = (
+        f"{json.dumps([camera.as_dict() for camera in cameras])}.map((camera) =>"
+        f" {json.dumps(places)}.map((place) => project(place, camera)))"
     )
-    done = subprocess.run(["node", str(script)], capture_output=True, text=True, check=True)
+    pixels = node(tmp_path, "geometry.js", "project", script)
     unseen = 0
-    for camera, found in zip(cameras, json.loads(done.stdout), strict=True):
+    for camera, found in zip(cameras, pixels, strict=True):
         expected = camera.project([(*place, -camera.cg_height_m) for place in places]) + 0.5
         for pixel, wanted in zip(found, expected.tolist(), strict=True):
             assert (pixel is None) == math.isnan(wanted[0])

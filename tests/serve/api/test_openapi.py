@@ -14,14 +14,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from serve.app import Service
-from tests.serve.conftest import (
-    Served,
-    constant_engine,
-    jpeg,
-    picture,
-    png,
-    serving,
-)
+from tests.serve.conftest import Served, constant_engine, jpeg, picture, png, serving
 
 EXAMPLES = int(os.environ.get("DRIVERVIEW_API_EXAMPLES", "10"))
 

@@ -1,7 +1,6 @@
 """The options of an image are the same for every endpoint, and no option is ignored."""
 
 import json
-import struct
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +8,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tests.serve.conftest import INFER, PATIENCE_S, Reply, Served, jpeg, picture
+from tests.serve.conftest import INFER, PATIENCE_S, Reply, Served, jpeg, picture, tensor_request
 
 WIDE = jpeg(picture(400, 300))
 HEADERS = {
@@ -29,14 +28,8 @@ def features(service: Served, query: str = "", headers: Pairs = ()) -> Reply:
 
 def infer(service: Served, query: str = "", headers: Pairs = (), **parameters: Any) -> Reply:
     """An inference request with the image as binary data."""
-    raw = struct.pack("<I", len(WIDE)) + WIDE
-    tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
-    content: dict[str, Any] = {"inputs": [{**tensor, "parameters": {"binary_data_size": len(raw)}}]}
-    if parameters:
-        content["parameters"] = parameters
-    head = json.dumps(content).encode()
-    length = ("Inference-Header-Content-Length", str(len(head)))
-    return post(service, INFER + query, head + raw, [length, *headers])
+    length, body = tensor_request(WIDE, **({"parameters": parameters} if parameters else {}))
+    return post(service, INFER + query, body, [*length.items(), *headers])
 
 
 def post(service: Served, path: str, body: bytes, headers: Pairs) -> Reply:

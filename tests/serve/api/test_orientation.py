@@ -1,6 +1,5 @@
 """Every endpoint first turns an image upright according to its EXIF orientation."""
 
-import base64
 import json
 import struct
 import zlib
@@ -9,7 +8,16 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from tests.serve.conftest import PATIENCE_S, FakeEngine, Served, jpeg, picture, png
+from tests.serve.conftest import (
+    INFER,
+    PATIENCE_S,
+    FakeEngine,
+    Served,
+    jpeg,
+    picture,
+    png,
+    tensor_request,
+)
 
 WIDE = picture(480, 210)
 
@@ -38,9 +46,8 @@ def test_endpoints_see_the_upright_image(
     with connect(f"ws://127.0.0.1:{service.port}/stream", open_timeout=PATIENCE_S) as socket:
         socket.send(body)
         assert json.loads(socket.recv(PATIENCE_S))["crop_px"] == [100, 0, 280, 210]
-    tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
-    request = {"inputs": [{**tensor, "data": [base64.b64encode(body).decode()]}]}
-    assert service.ask("POST", "/v2/models/track/infer", json.dumps(request)).status == 200
+    headers, request = tensor_request(body)
+    assert service.ask("POST", INFER, request, headers).status == 200
     for image in engine.images[-3:]:
         assert np.array_equal(image, WIDE[:, 100:380])
 

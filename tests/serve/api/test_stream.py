@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import socket
 import tracemalloc
 from typing import Any
 
@@ -15,15 +14,8 @@ from websockets.typing import Subprotocol
 from serve.api.stream import Stream
 from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
-from tests.serve.conftest import (
-    JPEG,
-    PATIENCE_S,
-    Gate,
-    Served,
-    constant_engine,
-    serving,
-    until,
-)
+from tests.serve.attacks.conftest import Target
+from tests.serve.conftest import JPEG, PATIENCE_S, Gate, Served, constant_engine, serving, until
 
 
 def dial(service: Served, path: str = "/stream", **options: Any) -> ClientConnection:
@@ -127,15 +119,8 @@ def test_a_message_that_is_too_long_closes_its_websocket_only(service: Served) -
 
 
 def test_a_client_that_is_still_sending_receives_the_close_frame(service: Served) -> None:
-    with socket.create_connection(("127.0.0.1", service.port), PATIENCE_S) as connection:
-        connection.sendall(
-            b"GET /stream HTTP/1.1\r\nhost: localhost\r\n"
-            b"upgrade: websocket\r\nconnection: upgrade\r\n"
-            b"sec-websocket-version: 13\r\nsec-websocket-key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-        )
-        assert connection.recv(65536).startswith(b"HTTP/1.1 101")
-        mask = bytes(4)
-        connection.sendall(b"\x82\xff" + (MAX_BODY_BYTES + 1).to_bytes(8, "big") + mask)
+    with Target(service.port).open_websocket() as connection:
+        connection.sendall(b"\x82\xff" + (MAX_BODY_BYTES + 1).to_bytes(8, "big") + bytes(4))
         said = connection.recv(1)  # the service has refused the message as too long
         for _ in range(4):
             connection.sendall(bytes(1 << 18))

@@ -1,18 +1,19 @@
 """Raw sockets for attacks, on loopback addresses only; every wait has a time limit."""
 
+import gc
 import json
 import os
 import socket
 import struct
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.serve.conftest import FakeEngine, Served, outputs, serving
+from tests.serve.conftest import FakeEngine, Served, outputs, serving, until
 
 WAIT_S = 60.0  # time limit of a step of an attack; long enough on a busy machine
 TEXT, BINARY, CONTINUATION, CLOSE, PING = 1, 2, 0, 8, 9
@@ -141,6 +142,35 @@ def resident_mb(pid: int | str = "self") -> float:
     """The resident memory of a process in MB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def types_in_cycles(work: Callable[[], object]) -> list[type]:
+    """The types of the objects that `work` leaves in reference cycles. They stay in memory until a
+    garbage collection, which would delay all clients."""
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        work()
+        gc.collect()
+        return [type(found) for found in gc.garbage]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+
+
+@contextmanager
+def uncollected(most_mb: float = 30) -> Iterator[None]:
+    """Without the garbage collector; in the end at most `most_mb` MB more are resident."""
+    gc.collect()
+    gc.disable()
+    before = resident_mb()
+    try:
+        yield
+        until(lambda: resident_mb() - before < most_mb)
+    finally:
+        gc.enable()
 
 
 @pytest.fixture

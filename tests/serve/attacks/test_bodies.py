@@ -23,15 +23,9 @@ from tests.serve.attacks.conftest import (
     read_rest,
     resident_mb,
     status_of,
+    uncollected,
 )
-from tests.serve.conftest import (
-    JPEG,
-    Served,
-    jpeg,
-    picture,
-    serving,
-    until,
-)
+from tests.serve.conftest import JPEG, Served, jpeg, picture, serving, until
 
 MB = 1 << 20
 
@@ -103,18 +97,12 @@ def test_an_upload_that_ends_early_leaves_nothing(
     service.post(JPEG)
     close(attack(target, 5))
     until(lambda: open_count(service) == 1)
-    gc.collect()
-    gc.disable()
-    try:
-        before = resident_mb()
+    with uncollected():
         close(attack(target, 40))
         until(lambda: open_count(service) == 1)
         assert service.post(JPEG).status == 200
         left = [o for o in gc.get_objects() if type(o) in (DirectRequest, FeaturesRequest)]
         assert len(left) <= 1  # of the connection above
-        until(lambda: resident_mb() - before < 30)
-    finally:
-        gc.enable()
 
 
 @pytest.mark.parametrize("path", ["/features", "/stream"])
@@ -122,10 +110,7 @@ def test_a_refused_image_leaves_no_body_in_a_reference_cycle(
     service: Served, target: Target, path: str
 ) -> None:
     body = JPEG[:-2] + b"\xff\x00" * (1 << 20)  # the engine's thread refuses it
-    gc.collect()
-    gc.disable()
-    before = resident_mb()
-    try:
+    with uncollected():
         if path == "/features":
             for _ in range(30):
                 assert service.post(body).status == 422
@@ -135,9 +120,6 @@ def test_a_refused_image_leaves_no_body_in_a_reference_cycle(
                 connection.sendall(frame(BINARY, body))
                 assert b"damaged" in connection.recv(1 << 16)
             close([connection])
-        until(lambda: resident_mb() - before < 30)
-    finally:
-        gc.enable()
 
 
 def test_an_idle_connection_keeps_no_body(service: Served, target: Target) -> None:

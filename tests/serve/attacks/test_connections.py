@@ -21,16 +21,9 @@ from tests.serve.attacks.conftest import (
     read_rest,
     send_all,
     status_of,
+    uncollected,
 )
-from tests.serve.conftest import (
-    JPEG,
-    PATIENCE_S,
-    Clock,
-    Gate,
-    Served,
-    serving,
-    until,
-)
+from tests.serve.conftest import JPEG, PATIENCE_S, Clock, Gate, Served, serving, until
 
 MB = 1 << 20
 TOKEN = "a-token-of-some-length"
@@ -145,16 +138,12 @@ def test_a_refused_handshake_leaves_no_reference_cycle(
     service: Served, target: Target, attack: Callable[[Target, int], list[socket.socket]]
 ) -> None:
     service.post(JPEG)
-    gc.collect()
-    gc.disable()
-    try:
+    with uncollected():
         close(attack(target, 10))
         until(lambda: open_count(service) == 1)
         kinds = (GuardedWebSocket, DirectProtocol)
         # One remaining connection is that of `service.post`.
         until(lambda: sum(isinstance(o, kinds) for o in gc.get_objects()) <= 1)
-    finally:
-        gc.enable()
 
 
 def test_pipelined_requests_are_bounded(service: Served, target: Target) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from runtime.access import host_name
+from runtime.access import host_name, read_token
 from serve.api.access import HostCheck
 from serve.cli import app
-from serve.config import Limits, ServiceConfig, check_proxies, network_of, read_token
+from serve.config import Limits, ServiceConfig, check_proxies, network_of
 from serve.problems import Problem
 from serve.scheduling.admission import MAX_CLIENT_MS, Admission
 from serve.scheduling.fair_queue import FairQueue
@@ -19,13 +19,7 @@ from serve.scheduling.streams import stream_key
 from serve.shared_memory import create_shared_memory
 from serve.workers.worker_process import WorkerTask
 from tests.serve.attacks.conftest import Target, read_rest, status_of
-from tests.serve.conftest import (
-    JPEG,
-    FakeEngine,
-    Served,
-    assert_problem,
-    serving,
-)
+from tests.serve.conftest import JPEG, FakeEngine, Served, assert_problem, serving
 from trackfeatures.errors import UserError
 
 TOKEN = "0123456789abcdef"

@@ -19,8 +19,9 @@ from serve.api.kserve_tensors import (
 )
 from serve.config import MAX_BODY_BYTES
 from serve.problems import Problem
+from tests.serve.attacks.conftest import types_in_cycles
 from tests.serve.attacks.loop_time import LOOP_S, held_s
-from tests.serve.conftest import INFER, Served, types_in_cycles
+from tests.serve.conftest import INFER, Served
 
 HEAD = '{"inputs":[{"name":"pixels","shape":[1,2,2,3],"datatype":"UINT8","data":'
 

@@ -17,15 +17,7 @@ from serve.observability.logs import ErrorLimit, Interval, JsonFormatter, Refusa
 from serve.problems import UNAUTHORIZED, Problem
 from tests.serve.attacks import attacks
 from tests.serve.attacks.conftest import Target, open_count
-from tests.serve.conftest import (
-    JPEG,
-    PATIENCE_S,
-    FakeEngine,
-    Gate,
-    Served,
-    serving,
-    until,
-)
+from tests.serve.conftest import JPEG, PATIENCE_S, FakeEngine, Gate, Served, serving, until
 
 
 def test_mutated_streams_raise_nothing_and_leave_nothing() -> None:

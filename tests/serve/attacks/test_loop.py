@@ -16,13 +16,7 @@ from serve.config import MAX_BODY_BYTES
 from serve.server.websocket import SMALL_BYTES
 from tests.serve.attacks.conftest import BINARY, CONTINUATION, Target, frame
 from tests.serve.attacks.loop_time import LOOP_S, least_s, watched
-from tests.serve.conftest import (
-    INFER,
-    JPEG,
-    PNG,
-    Served,
-    serving,
-)
+from tests.serve.conftest import INFER, JPEG, PNG, Served, serving
 
 pytestmark = pytest.mark.alone
 ROOM = MAX_BODY_BYTES - len(JPEG)

@@ -3,15 +3,7 @@
 import socket
 
 from tests.serve.attacks.attacks import JPEG, MANY, MB, Attack, dial_each
-from tests.serve.attacks.conftest import (
-    BINARY,
-    CONTINUATION,
-    PING,
-    TEXT,
-    Target,
-    frame,
-    send_all,
-)
+from tests.serve.attacks.conftest import BINARY, CONTINUATION, PING, TEXT, Target, frame, send_all
 
 
 def frames_before_the_handshake(target: Target, count: int = 64) -> list[socket.socket]:
@@ -54,11 +46,8 @@ def deep_texts(target: Target, count: int = 50) -> list[socket.socket]:
 
 def long_texts(target: Target, count: int = 32) -> list[socket.socket]:
     """Texts of 4 MB that need four times as much memory after decoding."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        connection.settimeout(1.0)
-        send_all(connection, frame(TEXT, "\N{AUTOMOBILE}".encode() + b"x" * (4 * MB - 100)))
-    return connections
+    text = "\N{AUTOMOBILE}".encode() + b"x" * (4 * MB - 100)
+    return _send_on_each(target, count, frame(TEXT, text), wait_s=1.0)
 
 
 def text_floods(target: Target, megabytes: int = 16) -> list[socket.socket]:
@@ -79,27 +68,17 @@ def kept_messages(target: Target, count: int = 32) -> list[socket.socket]:
 
 def broken_texts(target: Target, count: int = 50) -> list[socket.socket]:
     """A text that is not UTF-8, on each of many WebSockets."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        send_all(connection, frame(TEXT, b"\xff\xfe"))
-    return connections
+    return _send_on_each(target, count, frame(TEXT, b"\xff\xfe"))
 
 
 def half_frames(target: Target, count: int = 32) -> list[socket.socket]:
     """WebSockets that withhold the last byte of a message of 1 MB."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        send_all(connection, frame(BINARY, bytes(MB))[:-1])
-    return connections
+    return _send_on_each(target, count, frame(BINARY, bytes(MB))[:-1])
 
 
 def unread_answers(target: Target, count: int = 16) -> list[socket.socket]:
     """WebSockets whose clients do not read the answers."""
-    connections = [target.open_websocket() for _ in range(count)]
-    for connection in connections:
-        connection.settimeout(0.2)
-        send_all(connection, frame(BINARY, b"no image" * 128), 2000)
-    return connections
+    return _send_on_each(target, count, frame(BINARY, b"no image" * 128), 2000, wait_s=0.2)
 
 
 def left_websockets(target: Target, count: int = 32) -> list[socket.socket]:
@@ -121,6 +100,18 @@ WEBSOCKETS: tuple[Attack, ...] = (
     *(small_messages, deep_texts, long_texts, text_floods, broken_texts, half_frames),
     *(unread_answers, kept_messages, left_websockets, quiet_websockets),
 )
+
+
+def _send_on_each(
+    target: Target, count: int, sent: bytes, most: int = 1, wait_s: float | None = None
+) -> list[socket.socket]:
+    """WebSockets, on each of which `sent` is sent up to `most` times, waiting up to `wait_s`."""
+    connections = [target.open_websocket() for _ in range(count)]
+    for connection in connections:
+        if wait_s is not None:
+            connection.settimeout(wait_s)
+        send_all(connection, sent, most)
+    return connections
 
 
 def _send_until_full(connection: socket.socket, data: bytes) -> int:

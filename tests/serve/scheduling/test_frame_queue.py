@@ -19,22 +19,18 @@ from serve.scheduling.frame import Frame, FrameResult
 from serve.scheduling.frame_queue import INLINE_AFTER, FrameQueue
 from serve.scheduling.streams import StreamTable
 from serve.shared_memory import create_shared_memory
-from tests.serve.conftest import (
-    PATIENCE_S,
-    Gate,
-    constant_engine,
-    picture,
-    until,
-)
+from tests.serve.conftest import PATIENCE_S, Gate, constant_engine, picture, until
 
 
-def make_engine() -> Engine:
-    return constant_engine()
-
-
-def make_queue(engine: Engine, capacity: int = 0) -> FrameQueue:
+def make_queue(engine: Engine, capacity: int = 0, single_core: bool = False) -> FrameQueue:
     streams = StreamTable(create_shared_memory(1).streams())
-    return FrameQueue(engine, lambda _engine: None, streams, capacity)
+    return FrameQueue(engine, lambda _engine: None, streams, capacity, single_core)
+
+
+def start(queue: FrameQueue) -> None:
+    """Start the queue in the running event loop; returns once its engine is ready."""
+    queue.start()
+    until(lambda: queue.ready)
 
 
 def make_frame() -> Frame:
@@ -43,8 +39,8 @@ def make_frame() -> Frame:
 
 def test_reading_the_engine_changes_no_state() -> None:
     """The event loop reads `loaded` while the engine's thread works."""
-    queue = make_queue(make_engine())
-    new = make_engine()
+    queue = make_queue(constant_engine())
+    new = constant_engine()
     queue.stage_model(new, lambda: True)
     before = dict(vars(queue))
     assert queue.loaded.engine is new
@@ -52,8 +48,8 @@ def test_reading_the_engine_changes_no_state() -> None:
 
 
 def test_a_committed_engine_is_kept_when_another_is_staged_or_dropped() -> None:
-    queue = make_queue(make_engine())
-    committed, next_one = make_engine(), make_engine()
+    queue = make_queue(constant_engine())
+    committed, next_one = constant_engine(), constant_engine()
     queue.stage_model(committed, lambda: True)
     queue.stage_model(next_one, lambda: False)
     assert queue.loaded.engine is committed
@@ -71,8 +67,7 @@ def test_a_refusal_schedules_nothing_on_the_event_loop(monkeypatch: pytest.Monke
 
     async def scenario() -> list[Any]:
         loop = asyncio.get_running_loop()
-        queue.start()
-        until(lambda: queue.ready)
+        start(queue)
         result: asyncio.Future[FrameResult | Exception] = loop.create_future()
         queue.submit(make_frame(), result.set_result)
         await asyncio.sleep(0)
@@ -98,9 +93,7 @@ def test_frames_that_wait_together_are_processed_on_the_loop_by_a_worker_with_on
     does other work."""
     monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", math.inf)  # holds on a busy machine too
     events: list[str] = []
-    engine = make_engine()
-    streams = StreamTable(create_shared_memory(1).streams())
-    queue = FrameQueue(engine, lambda _engine: None, streams, 4, single_core)
+    queue = make_queue(constant_engine(), 4, single_core)
 
     def read(_camera: object) -> Any:
         events.append(threading.current_thread().name)
@@ -118,8 +111,7 @@ def test_frames_that_wait_together_are_processed_on_the_loop_by_a_worker_with_on
             events.append("other work")
 
     async def scenario() -> None:
-        queue.start()
-        until(lambda: queue.ready)
+        start(queue)
         end = time.monotonic() + PATIENCE_S
         while "MainThread" not in events:  # then the engine counts as fast, and the thread sleeps
             assert time.monotonic() < end
@@ -139,18 +131,11 @@ def test_a_worker_that_stops_while_frames_wait_for_its_loop_answers_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(frame_queue, "INLINE_MAX_MS", math.inf)
-    queue = FrameQueue(
-        make_engine(),
-        lambda _engine: None,
-        StreamTable(create_shared_memory(1).streams()),
-        capacity=4,
-        single_core=True,
-    )
+    queue = make_queue(constant_engine(), 4, single_core=True)
     frame = replace(make_frame(), small=True)
 
     async def scenario() -> list[FrameResult | Exception]:
-        queue.start()
-        until(lambda: queue.ready)
+        start(queue)
         loop = asyncio.get_running_loop()
         errors: list[dict[str, Any]] = []
         loop.set_exception_handler(lambda _loop, context: errors.append(context))
@@ -170,7 +155,7 @@ def test_a_worker_that_stops_while_frames_wait_for_its_loop_answers_them(
 
 
 def test_a_refusal_of_many_frames_holds_none_of_their_bodies() -> None:
-    queue = make_queue(make_engine(), capacity=1)
+    queue = make_queue(constant_engine(), capacity=1)
     for _ in range(2):
         queue._waiting.append(slot("10.0.0.1"))
     first = queue.refusal("10.0.0.1")
@@ -222,8 +207,7 @@ def test_a_full_queue_takes_a_frame_of_another_client() -> None:
     queue = make_queue(gate.engine, capacity=2)
 
     async def scenario() -> list[object]:
-        queue.start()
-        until(lambda: queue.ready)
+        start(queue)
         results: dict[str, asyncio.Future[FrameResult | Exception]] = {}
 
         async def submit(name: str, client: str) -> None:

@@ -11,14 +11,20 @@ from websockets.sync.client import connect
 
 from serve.server import guard, worker_server
 from tests.serve.attacks.conftest import Target, read_head, read_reply
-from tests.serve.conftest import (
-    JPEG,
-    PATIENCE_S,
-    FakeEngine,
-    Gate,
-    serving,
-    until,
-)
+from tests.serve.conftest import JPEG, PATIENCE_S, FakeEngine, Gate, Served, serving, until
+
+
+def stop(service: Served) -> None:
+    """Begin to stop the service; returns once it drains its connections."""
+    service.server.should_exit = True
+    until(lambda: service.server.guard.draining)
+
+
+def dial(service: Served) -> socket.socket:
+    """The only connection of the service, which has accepted it."""
+    connection = Target(service.port).dial()
+    until(lambda: len(service.server.server_state.connections) == 1)
+    return connection
 
 
 def read_all(connection: socket.socket) -> bytes:
@@ -38,8 +44,7 @@ def test_requests_under_way_are_answered_and_pipelined_ones_lose_no_reply(
         half.sendall(request[:-100])
         new.sendall(b"GET /hea")
         until(lambda: len(service.server.server_state.connections) == 3)
-        service.server.should_exit = True
-        until(lambda: service.server.guard.draining)
+        stop(service)
         many.sendall(request * 8)  # idle until now; only the first gets a reply
         half.sendall(request[-100:])
         new.sendall(b"lthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -57,8 +62,7 @@ def test_a_reply_that_was_begun_is_the_last_one_and_later_bytes_do_not_reset_it(
         connection = target.dial()
         connection.sendall(target.post(JPEG))
         until(gate.busy.is_set)
-        service.server.should_exit = True
-        until(lambda: service.server.guard.draining)
+        stop(service)
         gate.open.set()
         with connection:
             assert read_head(connection).startswith(b"HTTP/1.1 200")
@@ -77,11 +81,9 @@ def test_a_refusal_before_the_end_of_a_slow_body_is_not_lost(
         target = Target(service.port)
         headers = {} if stops else {"Connection": "close"}
         request = target.post(bytes(80_000), path, **{"Content_Encoding": "gzip", **headers})
-        connection = target.dial()
-        until(lambda: len(service.server.server_state.connections) == 1)
+        connection = dial(service)
         if stops:
-            service.server.should_exit = True
-            until(lambda: service.server.guard.draining)
+            stop(service)
         with connection:
             for start in range(0, len(request), 20_000):
                 connection.sendall(request[start : start + 20_000])
@@ -96,10 +98,8 @@ def test_requests_behind_a_refusal_that_ends_the_connection_are_dropped(
 ) -> None:
     with caplog.at_level(logging.ERROR), serving(engine) as service:
         target = Target(service.port)
-        connection = target.dial()
-        until(lambda: len(service.server.server_state.connections) == 1)
-        service.server.should_exit = True
-        until(lambda: service.server.guard.draining)
+        connection = dial(service)
+        stop(service)
         connection.sendall(target.post(JPEG, Content_Encoding="gzip") * 3)
         with connection:
             assert read_all(connection).count(b"HTTP/1.1 415") == 1
@@ -128,8 +128,7 @@ def test_a_websocket_gets_the_answers_that_it_is_owed_then_the_reason() -> None:
         with connect(f"ws://127.0.0.1:{service.port}/stream", compression=None) as websocket:
             websocket.send(JPEG)
             until(gate.busy.is_set)
-            service.server.should_exit = True
-            until(lambda: service.server.guard.draining)
+            stop(service)
             for _ in range(8):  # the service does not read these
                 websocket.send(JPEG)
             answer = pool.submit(websocket.recv, PATIENCE_S)
@@ -152,8 +151,7 @@ def test_no_websocket_is_opened_and_idle_connections_are_closed(
         for connection in connections:
             connection.sendall(target.ask())
             read_reply(connection)
-        service.server.should_exit = True
-        until(lambda: service.server.guard.draining)
+        stop(service)
         with connections[0] as connection:
             connection.sendall(target.handshake())
             assert b"HTTP/1.1 503" in read_all(connection)

@@ -15,7 +15,7 @@ from serve.config import MAX_BODY_BYTES, Limits
 from serve.scheduling import frame_queue, rate_limit
 from serve.scheduling.frame_queue import INLINE_AFTER, INLINE_MAX_MS
 from serve.server.fast_path import DirectProtocol
-from tests.serve.attacks.conftest import read_reply, read_rest
+from tests.serve.attacks.conftest import read_reply, read_rest, types_in_cycles
 from tests.serve.conftest import (
     JPEG,
     PATIENCE_S,
@@ -27,7 +27,6 @@ from tests.serve.conftest import (
     outputs,
     picture,
     serving,
-    types_in_cycles,
     until,
 )
 
