@@ -38,9 +38,10 @@ from benchmarks.service_load.malicious_clients import ADDRESS
 from benchmarks.service_load.servers import descendants
 from runtime.access import TOKEN_VARIABLE, is_loopback
 from runtime.sockets import bind
-from tests.serve.attacks.attacks import JPEG, Attack
+from tests.serve.attacks.attacks import Attack
 from tests.serve.attacks.conftest import Target, resident_mb
 from tests.serve.attacks.registry import ATTACKS
+from tests.serve.conftest import JPEG
 from trackfeatures.errors import UserError
 
 ANSWERED, SLOWER = 0.99, 3.0

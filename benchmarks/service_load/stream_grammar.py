@@ -5,8 +5,8 @@ Sources: RFC 9112 (messages, chunked coding), RFC 9110 (fields), RFC 6455 (hands
 
 import random
 
-from tests.serve.attacks.attacks import JPEG
 from tests.serve.attacks.conftest import frame
+from tests.serve.conftest import JPEG
 
 METHODS = (b"POST", b"GET", b"HEAD", b"PUT", b"OPTIONS", b"DELETE", b"CONNECT", b"PRI", b"X")
 TARGETS = (

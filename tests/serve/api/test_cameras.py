@@ -14,8 +14,8 @@ from serve.cameras import read_cameras
 from serve.client import Client, ServiceError
 from serve.config import Limits
 from serve.workers.worker_process import WorkerTask
-from tests.serve.api.test_options import JPEG, WIDE, features, infer, post, stream
-from tests.serve.conftest import CARD, PATIENCE_S, FakeEngine, Served, outputs, serving
+from tests.serve.api.test_options import WIDE, features, infer, post, stream
+from tests.serve.conftest import CARD, JPEG, PATIENCE_S, FakeEngine, Served, outputs, serving
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 

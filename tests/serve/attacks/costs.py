@@ -12,9 +12,9 @@ from functools import cache
 import cv2
 import numpy as np
 
-from tests.serve.attacks.attacks import JPEG, MANY, MB
+from tests.serve.attacks.attacks import MANY, MB
 from tests.serve.attacks.conftest import BINARY, Target, frame, read_head, send_all
-from tests.serve.conftest import INFER, jpeg, picture, png
+from tests.serve.conftest import INFER, JPEG, jpeg, picture, png
 
 BODY = 4 * MB  # the service's largest body
 ANSWER_S = 10.0  # without an answer for this time, an attacker stops

@@ -19,7 +19,7 @@ from tests.serve.attacks.conftest import (
     read_head,
     send_all,
 )
-from tests.serve.conftest import JPEG, FakeEngine, serving, until
+from tests.serve.conftest import INFER, JPEG, FakeEngine, serving, until
 
 MIB = 1 << 20
 
@@ -44,7 +44,7 @@ def test_bodies_that_are_held_back_give_way_to_small_ones(
         for _ in range(5):
             assert service.post(JPEG).status == 200
             assert bodies.held <= 8 * MIB
-            infer = service.ask("POST", costs.INFER, b"{}", {"Content-Type": "application/json"})
+            infer = service.ask("POST", INFER, b"{}", {"Content-Type": "application/json"})
             assert infer.status in (400, 422)
         for connection in connections:
             connection.close()

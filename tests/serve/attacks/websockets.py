@@ -2,8 +2,9 @@
 
 import socket
 
-from tests.serve.attacks.attacks import JPEG, MANY, MB, Attack, dial_each
+from tests.serve.attacks.attacks import MANY, MB, Attack, dial_each
 from tests.serve.attacks.conftest import BINARY, CONTINUATION, PING, TEXT, Target, frame, send_all
+from tests.serve.conftest import JPEG
 
 
 def frames_before_the_handshake(target: Target, count: int = 64) -> list[socket.socket]:
