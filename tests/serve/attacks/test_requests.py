@@ -56,31 +56,6 @@ from tests.serve.conftest import (
 )
 
 
-def scan(data: bytes, size: int = MAX_BODY_BYTES) -> bytes:
-    """A JPEG whose scan is followed by repeated `data`, `size` bytes in total."""
-    start = JPEG[:-2]
-    return start + (data * (size // len(data)))[: size - len(start)]
-
-
-@pytest.mark.alone
-@pytest.mark.parametrize(
-    "body",
-    [
-        b"\xff\xd8" + b"\xff" * (MAX_BODY_BYTES - 2),
-        JPEG[:2] + b"\xff" * (MAX_BODY_BYTES - len(JPEG)) + JPEG[2:],
-        scan(b"\xff\x00"),
-        scan(b"\xff"),
-        scan(b"\xff\xd0"),
-        scan(b"\xff\x00", WINDOW_BYTES),
-        scan(b"\xff", WINDOW_BYTES),
-        JPEG[:2] + b"\xff\xfe\x00\x02" * ((MAX_BODY_BYTES - len(JPEG)) // 4) + JPEG[2:],
-    ],
-    ids=["fill", "filled", "stuffed", "ff", "restarts", "small-stuffed", "small-ff", "comments"],
-)
-def test_no_jpeg_holds_the_event_loop(body: bytes) -> None:
-    assert held_s(lambda: inspect(body, CARD.camera)) < LOOP_S
-
-
 def with_chunks(body: bytes, chunk: bytes, count: int) -> bytes:
     """A PNG with `count` ancillary chunks of the content `chunk` after its header."""
     whole = len(chunk).to_bytes(4, "big") + b"teXt" + chunk

@@ -113,6 +113,20 @@ def test_a_stop_is_obeyed_while_the_model_is_loaded_and_a_reload_is_not_needed(
     assert not any(worker.alive for worker in workers.started)
 
 
+@pytest.mark.parametrize(
+    ("before", "now", "stops"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_hangup_stops_a_service_whose_terminal_was_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: bool, now: bool, stops: bool
+) -> None:
+    reloads: list[bool] = []
+    monkeypatch.setattr(module, "_has_terminal", lambda: before)
+    supervisor = make_supervisor(tmp_path)
+    monkeypatch.setattr(module, "_has_terminal", lambda: now)
+    supervisor._on_hangup(lambda: reloads.append(True))
+    assert (supervisor._stopping.is_set(), bool(reloads)) == (stops, not stops)
+
+
 def test_a_reload_after_a_failed_reload_loads_the_model(
     workers: FakeWorkers, tmp_path: Path
 ) -> None:
