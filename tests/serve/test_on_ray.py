@@ -1,7 +1,5 @@
 """The service on Ray Serve: two replicas, the application builder, the console script's name."""
 
-import http.client
-import json
 import os
 import re
 import signal
@@ -9,7 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,7 +18,7 @@ from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.cli import main
 from serve.config import Limits
-from tests.serve.conftest import PATIENCE_S, png
+from tests.serve.conftest import PATIENCE_S, Reply, Served, png
 from tests.serve.test_cli import ROOT, command
 from tests.typed import typed
 from trackfeatures.errors import UserError
@@ -71,27 +69,23 @@ def test_answers_of_two_replicas_equal_the_engines(published: Path, tmp_path: Pa
     image = golden_image(280, 210)
     body, right = png(image[:, :, ::-1]), decode_outputs(load_engine(published)(image)).as_json()
     with on_ray(published, tmp_path / "token", replicas=2) as port:
-        assert ask(port, "POST", "/features", body, token="wrong")[0] == 401
-        answers = [ask(port, "POST", "/features", body) for _ in range(REQUESTS)]
-        counts = {answered(ask(port, "GET", "/metrics")[1]) for _ in range(20)}
-    for status, content in answers:
-        answer = json.loads(content)
-        assert status == 200
-        assert {name: answer[name] for name in right} == right
-        assert answer["model"] == read_card(published).model_hash
+        assert Served(port).post(body, "image/png", Authorization="Bearer wrong").status == 401
+        # Ray chooses a replica for each connection.
+        answers = [ask(Served(port), "POST", "/features", body) for _ in range(REQUESTS)]
+        pages = [ask(Served(port), "GET", "/metrics").content for _ in range(20)]
+    counts = {answered(page) for page in pages}
+    for reply in answers:
+        assert reply.status == 200
+        assert {name: reply.content[name] for name in right} == right
+        assert reply.content["model"] == read_card(published).model_hash
     # Each replica counts its own requests: both have answered, together all requests.
     assert all(0 < count < REQUESTS for count in counts)
     assert sum(counts) == (REQUESTS if len(counts) == 2 else REQUESTS // 2)
 
 
-def ask(
-    port: int, method: str, path: str, body: bytes | None = None, token: str = TOKEN
-) -> tuple[int, bytes]:
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)) as connection:
-        headers = {"Authorization": f"Bearer {token}", "Content-Type": "image/png"}
-        connection.request(method, path, body, headers)
-        response = connection.getresponse()
-        return response.status, response.read()
+def ask(service: Served, method: str, path: str, body: bytes | None = None) -> Reply:
+    headers = {"Authorization": f"Bearer {TOKEN}", "Content-Type": "image/png"}
+    return service.ask(method, path, body, headers)
 
 
 def answered(page: bytes) -> int:

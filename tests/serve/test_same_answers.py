@@ -1,9 +1,7 @@
 """Answers for one image are equal across workers, engines, media types and endpoints."""
 
 import base64
-import http.client
 import json
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,43 +37,28 @@ FEATURES = (
 )  # fmt: skip
 PROVENANCE = ("model", "engine", "precision", "definitions_version")
 
-Connection = http.client.HTTPConnection
+
+def by_json(service: Served) -> dict[str, Any]:
+    return dict(service.post(JPEG).content)
 
 
-def post(connection: Connection, path: str, body: bytes, **headers: str) -> tuple[bytes, int]:
-    """The body of the answer, and the size of its JSON part in bytes."""
-    sent = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request("POST", path, body, sent)
-    response = connection.getresponse()
-    content = response.read()
-    assert response.status == 200, content
-    return content, int(response.headers.get("Inference-Header-Content-Length", len(content)))
+def by_messagepack(service: Served) -> dict[str, Any]:
+    return dict(msgspec.msgpack.decode(service.post(JPEG, Accept="application/msgpack").content))
 
 
-def by_json(connection: Connection) -> dict[str, Any]:
-    content, _ = post(connection, "/features", JPEG, Content_Type="image/jpeg")
-    return dict(json.loads(content))
-
-
-def by_messagepack(connection: Connection) -> dict[str, Any]:
-    headers = {"Content_Type": "image/jpeg", "Accept": "application/msgpack"}
-    content, _ = post(connection, "/features", JPEG, **headers)
-    return dict(msgspec.msgpack.decode(content))
-
-
-def by_tensors(connection: Connection) -> dict[str, Any]:
+def by_tensors(service: Served) -> dict[str, Any]:
     """The answer of the Open Inference Protocol in JSON."""
     tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
     request = {"inputs": [{**tensor, "data": [base64.b64encode(JPEG).decode()]}]}
-    content, _ = post(connection, INFER, json.dumps(request).encode())
-    answer = json.loads(content)
+    answer = service.ask("POST", INFER, json.dumps(request).encode()).content
     found = {output["name"]: output["data"] for output in answer["outputs"]}
     return {**as_features({k: list(v) for k, v in found.items()}), **answer["parameters"]}
 
 
-def by_raw_tensors(connection: Connection) -> dict[str, Any]:
+def by_raw_tensors(service: Served) -> dict[str, Any]:
     headers, body = tensor_request(JPEG, parameters={"binary_data_output": True})
-    content, end = post(connection, INFER, body, **headers)
+    reply = service.ask("POST", INFER, body, headers)
+    content, end = reply.content, int(reply.headers["inference-header-content-length"])
     answer = json.loads(content[:end])
     found = {}
     for output in answer["outputs"]:
@@ -117,10 +100,6 @@ def narrowed(value: Any) -> Any:
     return float(np.float32(value)) if isinstance(value, float) else value
 
 
-def wait_until_ready(service: Served) -> None:
-    until(lambda: service.app.frame_queue.ready)
-
-
 def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> None:
     """Two workers on two ports give equal answers for every media type and endpoint."""
     memory = create_shared_memory(blocks=2)
@@ -130,11 +109,9 @@ def test_workers_types_and_endpoints_give_the_same_answer(published: Path) -> No
         serving(load_engine(published), warm_up, shared=memory, block=1) as two,
     ):
         for service in (one, two):
-            wait_until_ready(service)
-            with closing(Connection("127.0.0.1", service.port, timeout=PATIENCE_S)) as connection:
-                plain += [by_json(connection), by_messagepack(connection)]
-                plain += [by_websocket(service.port)]
-                tensors += [by_tensors(connection), by_raw_tensors(connection)]
+            until(lambda: service.app.frame_queue.ready)  # noqa: B023
+            plain += [by_json(service), by_messagepack(service), by_websocket(service.port)]
+            tensors += [by_tensors(service), by_raw_tensors(service)]
     first = {name: plain[0][name] for name in (*FEATURES, *PROVENANCE)}
     assert all({name: answer[name] for name in first} == first for answer in plain)
     assert all({name: answer[name] for name in first} == narrowed(first) for answer in tensors)

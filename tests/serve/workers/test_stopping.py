@@ -9,8 +9,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -60,21 +61,17 @@ class Clients:
 
     def new_each_time(self) -> str:
         """Send a small request on a new connection."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
-        try:
-            connection.request("GET", "/healthz")
-            return reply_of(connection)
-        finally:
-            connection.close()
+        return self._ask_anew("GET", "/healthz")
 
     def large(self) -> str:
         """Send a large body, which is refused, on a new connection."""
+        return self._ask_anew("POST", "/features", bytes(1 << 20), {"Content-Type": "image/png"})
+
+    def _ask_anew(self, *request: Any) -> str:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
-        try:
-            connection.request("POST", "/features", bytes(1 << 20), {"Content-Type": "image/png"})
+        with closing(connection):
+            connection.request(*request)
             return reply_of(connection)
-        finally:
-            connection.close()
 
     def late(self) -> str:
         """Send a request 0.1 s after the connection was made."""
