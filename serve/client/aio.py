@@ -8,14 +8,28 @@ the other; for concurrent requests, use several clients.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from typing import Any, TypeVar
+from functools import partial, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from serve.client.sync import Client
 
+P = ParamSpec("P")
 T = TypeVar("T")
+
+
+def _in_thread(
+    method: Callable[Concatenate[Client, P], T],
+) -> Callable[Concatenate["AsyncClient", P], Coroutine[Any, Any, T]]:
+    """A method of `Client` as one of `AsyncClient`, with the same arguments."""
+
+    @wraps(method)
+    async def call(self: "AsyncClient", /, *arguments: P.args, **options: P.kwargs) -> T:
+        work = partial(method, self._client, *arguments, **options)
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+
+    return call
 
 
 class AsyncClient:
@@ -32,40 +46,16 @@ class AsyncClient:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
         self._closed = False
 
-    async def features(
-        self,
-        image: bytes,
-        content_type: str | None = None,
-        frame_id: str | None = None,
-        *,
-        stream: str | None = None,
-        deadline_s: float | None = None,
-        fov_y_deg: float | None = None,
-        camera: str | None = None,
-    ) -> dict[str, Any]:
-        """The track features of a JPEG or PNG file. Raises ServiceError."""
-        options: dict[str, Any] = {
-            "stream": stream,
-            "deadline_s": deadline_s,
-            "fov_y_deg": fov_y_deg,
-            "camera": camera,
-        }
-        send = partial(self._client.features, image, content_type, frame_id, **options)
-        return await self._in_thread(send)
-
-    async def model(self) -> dict[str, Any]:
-        """The card of the served model. Raises ServiceError."""
-        return await self._in_thread(self._client.model)
-
-    async def ready(self) -> bool:
-        """Whether the service can answer images."""
-        return await self._in_thread(self._client.ready)
+    features = _in_thread(Client.features)
+    model = _in_thread(Client.model)
+    ready = _in_thread(Client.ready)
+    _close = _in_thread(Client.close)
 
     async def close(self) -> None:
         """Close the connection and stop the thread; a second call has no effect."""
         if not self._closed:
             self._closed = True
-            await self._in_thread(self._client.close)
+            await self._close()
             self._thread.shutdown(wait=False)
 
     async def __aenter__(self) -> "AsyncClient":
@@ -73,6 +63,3 @@ class AsyncClient:
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
-
-    async def _in_thread(self, work: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, work)

@@ -116,8 +116,8 @@ def tensor_request(image: bytes, **more: Any) -> tuple[dict[str, str], bytes]:
     """The header and the body of an inference request with an image file as binary data."""
     raw = struct.pack("<I", len(image)) + image
     tensor = {"name": "image", "shape": [1, 1], "datatype": "BYTES"}
-    tensor |= {"parameters": {"binary_data_size": len(raw)}}
-    head = json.dumps({"inputs": [tensor], **more}).encode()
+    size = {"parameters": {"binary_data_size": len(raw)}}
+    head = json.dumps({"inputs": [{**tensor, **size}], **more}).encode()
     return {"Inference-Header-Content-Length": str(len(head))}, head + raw
 
 
@@ -263,7 +263,7 @@ class Served:
 @contextmanager
 def serving(
     engine: Engine | None = None,
-    check: Callable[[Any], object] | None = None,
+    check: Callable[[Any], Any] | None = None,
     limits: Limits | None = None,
     shared: SharedMemory | None = None,
     block: int = 0,
