@@ -1,7 +1,7 @@
 """HTTP connections with deadlines, and limits for their number and for the size of headers.
 
 This is uvicorn's httptools protocol, extended by a deadline for each phase of a connection.
-`close_expired` checks the deadlines ten times per second, so a deadline costs a request only a few
+`WorkerServer` checks the deadlines ten times per second, so a deadline costs a request only a few
 assignments. Trailers count as headers and are dropped.
 """
 

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -44,9 +44,8 @@ class Guarded(Protocol):
         """End the connection if a body has been arriving for EVICTABLE_S; returns its bytes."""
 
 
-@runtime_checkable
-class Drained(Protocol):
-    """The interface of a connection for a worker that stops."""
+class Drained(Guarded, Protocol):
+    """The interface of a connection for its worker, which can stop."""
 
     lingers: bool
     """Whether the last bytes were sent and the client has not closed the connection yet."""
@@ -216,11 +215,3 @@ def _is_any_of(address: str, networks: Iterable[str]) -> bool:
     except ValueError:  # not an IP address, e.g. of a Unix socket
         return False
     return any(found in ip_network(network, strict=False) for network in networks)
-
-
-def close_expired(connections: Iterable[object], now: float) -> None:
-    """Close the connections whose deadline has passed at `now`, in s of the guard's clock."""
-    for connection in list(connections):
-        expire = getattr(connection, "expire", None)
-        if expire is not None:
-            expire(now)

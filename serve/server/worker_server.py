@@ -15,14 +15,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
 
 from serve.app import Service
 from serve.config import MAX_BODY_BYTES, Limits
 from serve.server.fast_path import DirectProtocol
-from serve.server.guard import ConnectionGuard, Drained, close_expired
+from serve.server.guard import ConnectionGuard, Drained
 from serve.server.heap import HeapTrimmer
 from serve.server.websocket import GuardedWebSocket
 from serve.shared_memory import WorkerPeers
@@ -93,7 +93,7 @@ class WorkerServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Called ten times per second. Close expired connections, and one connection if another
         worker asked for room; publish this worker's status."""
-        close_expired(self.server_state.connections, self.guard.clock())
+        self._close_expired()
         self._make_room_for_others()
         self._publish_status()
         if counter % TRIM_TICKS == 0:
@@ -121,13 +121,19 @@ class WorkerServer(uvicorn.Server):
         start_s = self._loop.time()
         while not self.force_exit and (elapsed_s := self._loop.time() - start_s) < limit_s:
             await asyncio.sleep(DRAIN_STEP_S)  # first, to include connections accepted just now
-            close_expired(self.server_state.connections, self.guard.clock())
+            self._close_expired()
             done = [is_done(connection, elapsed_s) for connection in self._connections()]
             if all(done):
                 break
 
+    def _close_expired(self) -> None:
+        """Close the connections whose deadline has passed."""
+        now = self.guard.clock()
+        for connection in self._connections():
+            connection.expire(now)
+
     def _connections(self) -> list[Drained]:
-        return [c for c in self.server_state.connections if isinstance(c, Drained)]
+        return list(cast("set[Drained]", self.server_state.connections))
 
     def _make_room_for_others(self) -> None:
         least = self._peers.room_asked()
