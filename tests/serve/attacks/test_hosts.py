@@ -2,12 +2,10 @@
 
 import socket
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from runtime.access import host_name, read_token
 from serve.api.access import HostCheck
 from serve.cli import app
 from serve.config import Limits, ServiceConfig, check_proxies, network_of
@@ -146,13 +144,6 @@ def test_a_missing_host_is_refused_also_after_http_1_0_sent_none() -> None:
         check.check({})
 
 
-def test_names_of_hosts() -> None:
-    found = {host: host_name(host) for host in (b"A:1", b"[::1]:2", b"::1", b"a.", b"10.0.0.1")}
-    assert list(found.values()) == ["a", "::1", "::1", "a", "10.0.0.1"]
-    for host in (b"", b":80", b"a:b", b"[::1", b"[::1]x", b"a:\xb2"):
-        assert host_name(host) is None
-
-
 def test_a_64_is_one_client_and_ipv4_in_ipv6_is_ipv4() -> None:
     assert client_key("2001:db8::1") == client_key("2001:db8::ffff:2")
     assert client_key("2001:db8::1") != client_key("2001:db8:0:1::1")
@@ -264,9 +255,3 @@ def test_options_before_a_subcommand_are_refused(words: str) -> None:
     error = CliRunner().invoke(app, words.split()).exception
     assert isinstance(error, UserError)
     assert str(error).startswith(f"{words.split()[0]} before `{words.split()[-1]}` has no effect")
-
-
-def test_a_token_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "token").write_bytes(b"\xff" * 32)
-    with pytest.raises(UserError, match="printable ASCII"):
-        read_token(tmp_path / "token")
