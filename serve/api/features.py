@@ -190,20 +190,20 @@ class FrameHandler:
             about = (options.stamp_ns, options.request_id, options.frame_id, client)
             self.tracer.record_answer(span, *about, result)
 
-    def record_refusal(
-        self,
-        error: Problem | ImageError,
-        request_id: str,
-        client: str,
-        span: "Span | None" = None,
-    ) -> Problem:
+    def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
         """Count and log an error; returns the problem for the reply."""
         forget_frames(error)
         problem = as_problem(error)
+        self.record_problem(problem, request_id, client)
+        return problem
+
+    def record_problem(
+        self, problem: Problem, request_id: str, client: str, span: "Span | None" = None
+    ) -> None:
+        """Count and log the problem of a request. `span` is that of the request."""
         self.count_refusal(problem, request_id, client)
         if self.tracer is not None:
             self.tracer.record_problem(span, problem, request_id)
-        return problem
 
     def count_refusal(self, problem: Problem, request_id: str, client: str) -> None:
         """Count a refused request, and log it."""
@@ -226,7 +226,6 @@ class FeaturesRequest:
         self._frames = frames
         self._client = client
         self._send = send
-        self._share = frames.share()
         self._span: Span | None = None
 
     def receive(self, size: int) -> None:
@@ -247,8 +246,9 @@ class FeaturesRequest:
         # An overloaded worker must not read bodies. A frame of a stream can replace a queued one.
         full = None if b"x-stream-id" in headers else frames.queue.refusal(self._client)
         if full is not None:
-            self.refuse(full)
+            self._send_problem(full)
             return False
+        self._share = frames.share()
         try:
             self._options = parse_options(headers, stamp_ns, self._request_id)
             check_image_headers(headers)
@@ -270,8 +270,11 @@ class FeaturesRequest:
     def refuse(self, error: Problem | ImageError) -> None:
         """Reply with the problem of an error."""
         self._share.close()
-        who = (self._request_id, self._client)
-        problem = self._frames.record_refusal(error, *who, self._span)
+        forget_frames(error)
+        self._send_problem(as_problem(error))
+
+    def _send_problem(self, problem: Problem) -> None:
+        self._frames.record_problem(problem, self._request_id, self._client, self._span)
         self._finish(problem_reply(problem, (b"x-request-id", self._request_id.encode())))
 
     def _on_result(self, result: FrameResult | Exception) -> None:
