@@ -23,11 +23,11 @@ from benchmarks.claims.outcome import conclude, not_measured, run_command
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
 from mtlnet.inference.prediction import decode_outputs
-from mtlnet.predict.films import Film
-from mtlnet.predict.pictures import Picture, fit
 from mtlnet.predict.run import predict_files
-from mtlnet.predict.sources import SourceImage
 from mtlnet.predict.writers import FilmWriter, draw_prediction
+from mtlnet.sources.films import Film
+from mtlnet.sources.pictures import Picture, fit
+from mtlnet.sources.read import SourceImage
 
 CLAIM_FPS = 45.0
 CORES = 2

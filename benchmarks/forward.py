@@ -31,10 +31,10 @@ from numpy.typing import NDArray
 from benchmarks.claims.outcome import conclude, run_command
 from benchmarks.service_load.servers import model_copy
 from mtlnet.export.int8 import quantise
-from mtlnet.export.openvino_graph import build_graph
 from mtlnet.inference.engine import best_precision, openvino_core, read_graph
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.network import load_network
+from mtlnet.openvino_graph import build_graph
 
 CLAIMS = {
     "bf16": 0.40,

@@ -33,9 +33,11 @@ from benchmarks.recordings.enlarged import collect_few
 from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import Loader
 from mtlnet.model.network import Network, initialise
-from mtlnet.training.loss import multi_task_loss
+from mtlnet.training.device import keep_freed_memory
+from mtlnet.training.losses.multi_task import multi_task_loss
+from mtlnet.training.losses.task_weighting import TaskWeighting
 from mtlnet.training.recipes import RECIPES, WARM_UP
-from mtlnet.training.trainer import MIN_STEPS_BEFORE_BN_FREEZE, Trainer, keep_freed_memory
+from mtlnet.training.trainer import MIN_STEPS_BEFORE_BN_FREEZE, Trainer
 from trackfeatures.camera import CameraParameters
 
 MOST_OVER_MEMORY = 1.05
@@ -104,11 +106,12 @@ def plain(frames: Frames, size: int) -> Step:
     initialise(network, 0)
     network.train()
     optimiser = torch.optim.AdamW(network.parameters(), 1e-3)
+    weighting = TaskWeighting("fixed", ALPHA, torch.device("cpu"))
     batches = forever()
 
     def step() -> None:
         images, target, heading = next(batches)
-        losses = multi_task_loss(network(images), target, heading, ALPHA)
+        losses = multi_task_loss(network(images), target, heading, weighting.total)
         optimiser.zero_grad()
         torch.autograd.backward(losses.total)
         optimiser.step()

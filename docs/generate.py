@@ -61,6 +61,9 @@ def _name(parameter: Any) -> str:
 
 
 def _default(parameter: Any) -> str:
+    shown = getattr(parameter, "show_default", None)
+    if isinstance(shown, str):
+        return shown
     value = parameter.default
     empty = value is None or value == "" or value is False or callable(value)
     return "" if empty or "Sentinel" in type(value).__name__ else f"`{value}`"

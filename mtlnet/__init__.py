@@ -12,7 +12,7 @@ __all__ = ["Features", "Model", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """The interface is imported when it is used: `import mtlnet` alone loads no numpy, no torch."""
+    """Import the interface when it is used: `import mtlnet` alone loads neither numpy nor torch."""
     if name not in __all__:
         raise AttributeError(f"module 'mtlnet' has no attribute {name!r}")
     from mtlnet import api

@@ -17,28 +17,29 @@ from mtlnet.inference.model_card import ModelCard, resolve_run
 from mtlnet.inference.overlay import draw_markings
 from mtlnet.inference.prediction import Prediction
 from mtlnet.inference.rectification import Rectification, read_camera
-from mtlnet.predict.kinds import Kind
 from mtlnet.predict.lenses import with_lens
-from mtlnet.predict.pictures import Lens, Picture, fit
 from mtlnet.predict.run import answer, first_of
-from mtlnet.predict.sources import Source, SourceImage, find_sources, read_sources
 from mtlnet.predict.writers import draw_prediction
+from mtlnet.sources.find import Source, find_sources
+from mtlnet.sources.kinds import Kind
+from mtlnet.sources.pictures import Lens, Picture, fit
+from mtlnet.sources.read import SourceImage, read_sources
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 Image = NDArray[np.uint8]
 OneImage = str | Path | bytes | Image
-"""A file, the bytes of a file (JPEG, PNG, ...), or pixels (H, W, 3) uint8 RGB."""
+"""An image: a file, the bytes of a file (JPEG, PNG, ...), or pixels (H, W, 3) uint8 RGB."""
 
 log = logging.getLogger("mtlnet")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Prediction):
-    """The features of one image; attributes and units are those of `Prediction`."""
+    """The features of one image; for attributes and units see `Prediction`."""
 
     source: SourceImage
-    """The image in the model's view, its name and time."""
+    """The image in the model's view, with its name and time."""
     camera: CameraParameters
     """The camera that took the image, at any size of its aspect ratio."""
     model_camera: CameraParameters
@@ -46,12 +47,13 @@ class Features(Prediction):
 
     @property
     def name(self) -> str:
-        """The image's file; `film.mp4#12` for a frame of a film; empty for bytes and pixels."""
+        """File of the image; `film.mp4#12` for a frame of a film; empty for bytes and pixels."""
         return self.source.name
 
     @property
     def time_s(self) -> float | None:
-        """Time of the image in s since the start of its film; since 1970 if that is recorded."""
+        """Time of the image in s: since 1970 if recorded, else since the start of its film; None:
+        unknown."""
         return self.source.time_s
 
     def draw(self, image: OneImage | None = None) -> Image:
@@ -73,7 +75,7 @@ class Features(Prediction):
 
 
 class Options(TypedDict, total=False):
-    """The options of `Model.predict`, which describes them."""
+    """The options of `Model.predict`; see there."""
 
     camera: str | Path | CameraParameters | None
     fov_y_deg: float | None
@@ -93,7 +95,7 @@ class Model:
 
     @property
     def card(self) -> ModelCard:
-        """What the model is: network, camera, training data, hashes."""
+        """Card of the model: network, camera, training data, hashes."""
         return self._engine.card
 
     @property
@@ -123,15 +125,14 @@ class Model:
         `source`: an image file, the bytes of one or pixels (H, W, 3) uint8 RGB give `Features`; a
         list of these gives a list. A film, folder, pattern, recorded round, ROS 2 bag, webcam
         number or address of a stream (all as text, as for `mtlnet predict`) gives an iterator,
-        which reads and answers image by image.
-        `camera`: a camera file or CameraParameters; "model": the model's own. None: the same, but
-        the mount of a film's camera is found from what it shows.
-        `fov_y_deg`: vertical field of view of the images, if that is all that is known of their
-        camera. `topic`: the topic of a recording that holds the pictures.
+        which reads and answers image by image. `camera`: a camera file or CameraParameters;
+        "model": the model's own; None: the model's own, with the mount of a film's camera estimated
+        from the film. `fov_y_deg`: vertical field of view of the images, if nothing else is known
+        about their camera. `topic`: topic of a recording that holds the pictures.
 
-        Raises UserError for a source that cannot be used (ImageError: one image). An iterator
-        raises it after the last image, if any of them could not be used. What was found or left
-        out goes to the logger `mtlnet`.
+        Raises UserError for a source that cannot be used (ImageError for one image). An iterator
+        raises it after the last image, if any image could not be used. Notes on what was found or
+        left out go to the logger `mtlnet`.
         """
         lens = self._lens(camera, fov_y_deg)
         if isinstance(source, str | Path):
@@ -197,8 +198,8 @@ class Model:
         """The errors on a dataset, as `mtlnet evaluate --json` prints them, in m and rad.
 
         `data`: a folder of recorded rounds, or of pictures with a `labels.csv`. `split`: train,
-        test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" adds changed
-        copies of pictures. `page`: an HTML file to write. Raises UserError.
+        test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" adds copies of
+        pictures. `page`: an HTML file to write. Raises UserError.
         """
         from mtlnet.evaluation.evaluate import evaluate
 
@@ -215,12 +216,13 @@ class Model:
         out: str | Path | None = None,
         frames: int = 64,
     ) -> dict[str, Any]:
-        """Write the model as "onnx" or "openvino", in "f32", "bf16" or "int8", as `mtlnet export`.
+        """Write the model as "onnx" or "openvino", in "f32", "bf16" or "int8", as `mtlnet export`
+        does.
 
-        `data`: the dataset whose frames check the result; None: that of the training. `out`: the
-        folder to write; None: `export/` in the model's folder. Returns what `mtlnet export --json`
-        prints. Raises UserError for an export that does not exist, ModelError when the result
-        differs from torch.
+        `data`: the dataset whose frames check the result; None: the training data. `out`: the
+        folder to write; None: a folder in `export/` of the model's folder. Returns the result of
+        `mtlnet export --json`. Raises UserError for an unsupported export, ModelError when the
+        result differs from torch.
         """
         from mtlnet.export.convert import export_model
 
@@ -237,10 +239,11 @@ def load(
 ) -> Model:
     """Load a model, ready to answer.
 
-    `model`: "default" (the model that ships), the name of a run in `runs/` or the folder of a run.
+    `model`: "default" (the shipped model), the name of a run in `runs/`, or the folder of a run.
     `engine`: "openvino" or "torch". `precision`: "int8", "bf16" or "f32"; None: int8 if the model
-    has an int8 graph that passed its accuracy gate, else bf16 where the processor has it, else f32.
-    `threads`: threads of one answer. Raises ModelError when the model is missing or damaged.
+    has an int8 graph that passed its accuracy gate, else bf16 if the processor supports it, else
+    f32. `threads`: number of threads for one answer. Raises ModelError when the model is missing or
+    damaged.
     """
     return Model(resolve_run(str(model)), engine, precision, threads)
 

@@ -3,12 +3,16 @@
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from mtlnet import cli_options as options
+from mtlnet.ablation.config import AblationConfig
+from mtlnet.calibration.config import CalibrateConfig
+from mtlnet.training.config import TrainConfig
 from runtime import cli as command
+from runtime.options import options_of
 
 if TYPE_CHECKING:
     from mtlnet.inference.engine import Engine
@@ -20,87 +24,46 @@ app = typer.Typer(
     add_completion=False,
 )
 SPIN_COUNT = "10000"
-"""Iterations that OpenMP's threads spin before they sleep, and leave their core to the threads that
-decode images: a step took 1.07 times as long with OpenMP's default, 300,000."""
+"""Number of iterations that OpenMP's threads spin before they sleep and free their core for the
+threads that decode images; with OpenMP's default, 300,000, a step took 1.07 times as long."""
 MAX_PRINTED = 40
-"""Rows of the table that `predict` prints."""
+"""Maximum number of rows of the table that `predict` prints."""
 
 
 @app.command("train")
+@options_of(TrainConfig, only_given=True)
 def train_command(
-    data: options.TrainData = None,
-    out: options.TrainOut = None,
-    alpha: options.Alpha = None,
-    network: options.Network = None,
+    given: dict[str, Any],
     heads: options.Heads = None,
-    balance: options.Balance = None,
-    init: options.Init = None,
-    recipe: options.TrainRecipe = None,
-    iterations: options.TrainIterations = None,
-    minutes: options.Minutes = None,
-    seed: options.Seed = None,
-    batch: options.TrainBatch = None,
-    device: options.TrainDevice = None,
-    threads: options.TrainThreads = None,
-    skip_undecodable: options.SkipUndecodable = False,
-    hold_out_drives: options.HoldOutDrives = None,
     resume: options.Resume = False,
-    change_data: options.ChangeData = False,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Train the network on the train rounds of a dataset; the result is a model for `serve`."""
+    """Train a network on the train rounds of a dataset; the result is a model for `serve`."""
     os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # torch's OpenMP reads it when it is loaded
-    from mtlnet.training.loss import parse_alpha
-    from mtlnet.training.run import start_training
+    from mtlnet.train import start_training
 
-    given = {
-        "data": data,
-        "alpha": None if alpha is None else parse_alpha(alpha),
-        "network": network,
-        "heads": heads,
-        "balance": balance,
-        "init": init,
-        "recipe": recipe,
-        "iterations": iterations,
-        "minutes": minutes,
-        "seed": seed,
-        "batch": batch,
-        "device": device,
-        "threads": threads,
-        "skip_undecodable": skip_undecodable or None,
-        "hold_out_drives": hold_out_drives,
-        "change_data": change_data or None,
-    }
-    chosen = {name: value for name, value in given.items() if value is not None}
-    result = start_training(chosen, out, resume=resume)
+    out = given.pop("out", None)
+    if heads is not None:
+        given["heads"] = heads
+    result = start_training(given, out, resume=resume)
     if as_json and result:
         typer.echo(json.dumps(result))
 
 
 @app.command("ablate")
+@options_of(AblationConfig)
 def ablate_command(
-    out: options.AblationOut,
-    iterations: options.Iterations,
-    data: options.Data = Path("datasets/default"),
-    seeds: options.Seeds = "1,2,3",
-    recipe: options.Recipe = "fast",
+    config: AblationConfig,
     backbone: options.Backbone = "mobilenet_v3_small",
     rows: options.Rows = "",
-    batch: options.Batch = 32,
-    split: options.AblationSplit = "test",
-    every: options.Every = 5,
-    device: options.Device = "auto",
-    threads: options.Threads = 0,
     dry_run: options.DryRun = False,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """The ablation table of the paper: each task alone, MTL 1 to 4, and two other networks."""
-    from mtlnet.evaluation.ablation import AblationConfig, ablation_rows, parse_seeds
-    from mtlnet.evaluation.ablation_run import ablate
+    """Train and evaluate the paper's ablation table: each task alone, MTL 1 to 4, two other
+    networks."""
+    from mtlnet.ablation.plan import ablation_rows
+    from mtlnet.ablation.run import ablate
 
-    config = AblationConfig(
-        data, out, iterations, parse_seeds(seeds), recipe, batch, split, every, device, threads
-    )
     result = ablate(config, ablation_rows(backbone, rows), dry_run=dry_run)
     if as_json:
         typer.echo(json.dumps(result))
@@ -114,9 +77,10 @@ def export_command(
     data: options.CheckData = None,
     out: options.ExportOut = None,
     frames: options.CheckFrames = 64,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Write a model as ONNX or OpenVINO, compared with torch; int8 must pass an accuracy gate."""
+    """Write a model as ONNX or OpenVINO and compare it with torch; int8 must pass an accuracy
+    gate."""
     from rich.console import Console
 
     from mtlnet.evaluation.tables import export_lines
@@ -138,11 +102,11 @@ def ship_command(
     evaluation: options.ShippedEvaluations = None,
     notes: options.ShippedNotes = None,
     picture: options.ShippedPicture = None,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Write a model as weights alone, in float16: small enough for a repository.
+    """Write a model as weights alone, in float16, small enough for a repository.
 
-    With --evaluation: the page of figures of the model that is in --out.
+    With --evaluation: write README.md, with the figures of evaluations, for the model in --out.
     """
     from mtlnet.export.ship import ship_model, write_page
     from mtlnet.inference.model_card import resolve_run
@@ -171,9 +135,10 @@ def evaluate_command(
     copies: options.Copies = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Errors in metres and radians on a dataset, beside those of the constant training mean."""
+    """Evaluate a model on a dataset: errors in m and rad, and those of a constant prediction (the
+    training mean)."""
     import os
 
     from rich.console import Console
@@ -222,15 +187,16 @@ def predict_command(
     topic: options.Topic = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Track features of images, films, webcams, streams, rounds, Foxglove files or ROS 2 bags."""
+    """Predict track features of images, films, webcams, streams, rounds, Foxglove files or ROS 2
+    bags."""
     from rich.console import Console
 
     from mtlnet.evaluation.tables import prediction_table
     from mtlnet.inference.rectification import Rectification, read_camera
-    from mtlnet.predict.pictures import Lens
     from mtlnet.predict.run import InputsLeftOut, predict_files
+    from mtlnet.sources.pictures import Lens
     from trackfeatures.errors import UserError
 
     own = str(camera) == "model"
@@ -271,31 +237,18 @@ def predict_command(
 
 
 @app.command("calibrate")
-def calibrate_command(
-    inputs: options.CalibrateInputs,
-    out: options.CalibrateOut = Path("camera.yaml"),
-    board: options.Board = "",
-    fisheye: options.Fisheye = False,
-    drive: options.Drive = False,
-    camera: options.LensFile = None,
-    fov_y_deg: options.LensFieldOfView = None,
-    photo: options.Photo = None,
-    lane_width: options.LaneWidth = None,
-    page: options.CalibrationPage = None,
-    as_json: options.Json = False,
-) -> None:
-    """A camera file from a film of a drive (the mount), or from pictures of a board (the lens)."""
-    from mtlnet.calibration.run import CalibrateConfig, calibrate
+@options_of(CalibrateConfig)
+def calibrate_command(config: CalibrateConfig, as_json: command.AsJson = False) -> None:
+    """Make a camera file from a film of a drive (the mount) or from pictures of a board (the
+    lens)."""
+    from mtlnet.calibration.run import calibrate
 
-    config = CalibrateConfig(
-        inputs, out, board, fisheye, drive, camera, fov_y_deg, photo, lane_width, page
-    )
     with command.progress_bar() as bar:
         task = bar.add_task("calibrating", total=None)
         result, line = calibrate(
             config, lambda done, total: bar.update(task, completed=int(done), total=int(total))
         )
-    command.print_result(result, as_json, f"{out}: {line}")
+    command.print_result(result, as_json, f"{config.out}: {line}")
 
 
 @app.command("label")
@@ -310,11 +263,12 @@ def label_command(
     insecure: options.LabelInsecure = False,
     table: options.ImportTable = None,
     label_std: options.LabelStdGiven = None,
-    as_json: options.Json = False,
+    as_json: command.AsJson = False,
 ) -> None:
-    """Label pictures in the browser: drag the lane's two markings, metres and heading follow.
+    """Label pictures in the browser: drag the lane's two markings; distances and angle are
+    computed.
 
-    With --import: convert a table of labels, and copy its pictures to FOLDER.
+    With --import: convert a table of labels and copy its pictures to FOLDER.
     """
     from mtlnet.label.import_table import import_labels, parse_label_std
     from runtime.access import check_exposure, read_token
@@ -340,14 +294,14 @@ def label_command(
 
 
 def _print_model(name: str) -> None:
-    """Print on stderr the run folder that a model's name stands for."""
+    """Print the run folder of a model's name on stderr."""
     from mtlnet.inference.model_card import resolve_run
 
     typer.echo(f"model: {resolve_run(name)}", err=True)
 
 
 def _load(model: str, kind: str, precision: str | None, *, gpu: bool = False) -> "Engine":
-    """The engine of a model, with one thread; `gpu`: of torch on a GPU where there is one."""
+    """The engine of a model, with one thread; `gpu`: the torch engine on a GPU if there is one."""
     from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
     from mtlnet.inference.model_card import resolve_run
 

@@ -5,6 +5,7 @@ text files get surrogates as escapes: the Latin-1 name `caf\\xe9.jpg` becomes `c
 """
 
 import fcntl
+import hashlib
 import json
 import os
 import re
@@ -51,6 +52,17 @@ def utf8_path(path: Path) -> Iterator[Path]:
             link = link.with_suffix(whole.suffix)
             link.symlink_to(whole)
             yield link
+
+
+def name_as_text(name: str) -> str:
+    """Name of a file as text, with bytes that are not UTF-8 as escapes."""
+    return name.encode(errors="backslashreplace").decode()
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's bytes, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_folder(path: Path) -> None:

@@ -16,8 +16,8 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.inference.model_card import SHIPPED, WEIGHTS, read_card
-from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network
 
 Pass = Callable[[], Tensor]

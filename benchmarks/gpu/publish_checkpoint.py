@@ -10,12 +10,12 @@ from pathlib import Path
 
 from safetensors import safe_open
 
+from mtlnet.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.export.publish import Provenance, publish
-from mtlnet.inference.model_card import golden_image
-from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.inference.golden_image import golden_image
 from mtlnet.model.network import Network
 from mtlnet.training.checkpoint import list_checkpoints
-from mtlnet.training.config import read_config
+from mtlnet.training.configure import read_config
 from mtlnet.training.recipes import find_recipe
 from trackfeatures.errors import UserError
 

@@ -20,7 +20,6 @@ from datagen.recording.folder import (
     discard_partial,
     discard_partials,
     end_merge,
-    file_sha256,
     is_unstarted,
     partial_path,
     prepare,
@@ -32,6 +31,7 @@ from datagen.recording.folder import (
 from datagen.recording.manifest import rebuild
 from datagen.recording.names import SIDES
 from datagen.recording.splits import Split
+from runtime.files import file_hash
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ def _copy_round(folder: Path, state: RoundState, out: Path) -> None:
     partial = partial_path(out, state.id)
     try:
         shutil.copyfile(folder / state.file, partial)
-        if file_sha256(partial) != state.sha256:
+        if file_hash(partial) != state.sha256:
             raise DatasetError(
                 f"{folder / state.file} is damaged (its SHA-256 differs from the recorded one); "
                 "delete it and record that shard again"

@@ -4,7 +4,6 @@ A round is written under `.partial/`, read back, checked, hashed, synced and ren
 `state/ID.json` then holds its hashes. All other files are derived from these (see `manifest`).
 """
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterable
@@ -16,7 +15,7 @@ from pathlib import Path
 from datagen.recording.errors import DatasetError
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.schema.json_schema import SCHEMA_FILE, schema_text
-from runtime.files import atomic_move, atomic_write, unfinished_path
+from runtime.files import atomic_move, atomic_write, file_hash, unfinished_path
 from trackfeatures.names import require_name
 
 PARTIAL = ".partial"
@@ -24,7 +23,6 @@ LOCKS = ".locks"
 MERGING = ".merging"  # exists from the first round of a merge to the last
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
 PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FILE)
-READ_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +44,7 @@ class RoundState:
             id=header.id,
             file=f"rounds/{header.id}.mcap",
             bytes=path.stat().st_size,
-            sha256=file_sha256(path),
+            sha256=file_hash(path),
             frames=result.frames,
             content_hash=result.content_hash,
             definitions=header.definitions,
@@ -170,15 +168,6 @@ def read_states(folder: Path) -> dict[str, RoundState]:
         if file.is_file() and file.stat().st_size == state.bytes:
             states[state.id] = state
     return states
-
-
-def file_sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(READ_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def write_if_changed(path: Path, text: str) -> None:

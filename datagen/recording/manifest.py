@@ -16,12 +16,12 @@ from datagen.recording.dataset import Dataset
 from datagen.recording.folder import (
     PUBLISHED_FILES,
     end_merge,
-    file_sha256,
     read_states,
     write_if_changed,
 )
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
+from runtime.files import file_hash
 from trackfeatures.camera import stored
 
 MANIFEST = "manifest.json"
@@ -52,7 +52,7 @@ def build_manifest(dataset: Dataset) -> dict[str, Any]:
         "definitions": tf.VERSION,
         "content_hash": dataset.content_hash,
         "frames": sum(info.frames for info in dataset.rounds),
-        "files": {name: file_sha256(path) for name, path in paths.items() if path.is_file()},
+        "files": {name: file_hash(path) for name, path in paths.items() if path.is_file()},
         "rounds": rounds,
     }
 

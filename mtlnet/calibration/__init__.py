@@ -1,1 +1,1 @@
-"""Cameras from what people have: pictures of a board, or a film of a drive."""
+"""Calibrates cameras from pictures of a board (the lens) or a film of a drive (the mount)."""

@@ -1,6 +1,6 @@
-"""A lens from pictures of a chessboard or a ChArUco board, by OpenCV's calibration.
+"""Calibrates a lens from pictures of a chessboard or a ChArUco board, with OpenCV.
 
-Board frame in squares; pixels with centres at whole numbers.
+Board frame in squares; pixel centres at whole numbers.
 """
 
 from collections import Counter
@@ -19,28 +19,30 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 SMALLEST = (3, 3)
-"""Inner corners of the chessboards that are recognised."""
+"""Least number of inner corners of a recognised chessboard."""
 DICTIONARY, MARKER = "4X4_50", 0.75
 MIN_PICTURES = 3
 FEW = 8
-"""Pictures below which the third radial coefficient stays 0: it would follow the noise."""
+"""Number of pictures below which the third radial coefficient stays 0, because it would fit the
+noise."""
 MIN_CHARUCO = 8
 OUTLIER = 4.0
-"""A picture is left out when its error is so many times the median's, and above 1 px."""
+"""A picture is left out if its error exceeds this multiple of the median error, and 1 px."""
 Picture = NDArray[np.uint8]
 Corners = NDArray[np.float32]
 Finder = Callable[[Picture], tuple[Corners, Corners] | None]
-"""Corners on the board (N, 3) and in a grey picture (N, 2); None where it shows no board."""
+"""Finds the corners on the board (N, 3) and in a grey picture (N, 2); None where it shows no
+board."""
 
 
 class NoBoard(UserError):
-    """Pictures from which no lens can be calibrated."""
+    """The pictures do not allow a calibration of the lens."""
 
 
 @dataclass(frozen=True)
 class BoardPicture:
-    """A picture with its corners (N, 2) px and the error of their projections, root mean square;
-    a picture without a board has `problem` instead."""
+    """A picture with its corners (N, 2) px, their projections, and the root mean square error; a
+    picture that is not used has a `problem` instead."""
 
     path: Path
     corners: NDArray[np.float64]
@@ -51,7 +53,8 @@ class BoardPicture:
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """The lens; `focal_std_px` is that of fy, `error_px` over all corners used."""
+    """The calibrated lens; `focal_std_px` is the standard deviation of fy, `error_px` the error
+    over all used corners."""
 
     camera: CameraParameters
     board: str
@@ -61,18 +64,19 @@ class BoardCalibration:
 
     @property
     def used(self) -> int:
-        """Number of pictures the lens was found from."""
+        """Number of pictures used for the lens."""
         return sum(not picture.problem for picture in self.pictures)
 
 
 def calibrate_board(
     paths: Sequence[Path], board: str, model: CameraParameters, fisheye: bool = False
 ) -> BoardCalibration:
-    """The lens of the camera that took `paths`, which show one board.
+    """The lens of the camera that took `paths`, which all show one board.
 
-    `board`: inner corners of a chessboard, as "9x6"; "charuco:5x7", squares of a ChArUco board,
-    with ":DICTIONARY:MARKER" (the marker's side in squares) if they are not 4X4_50 and 0.75; empty:
-    the chessboard that most pictures show. The mount is that of `model`. Raises NoBoard.
+    `board`: inner corners of a chessboard, such as "9x6"; "charuco:5x7" for the squares of a
+    ChArUco board, followed by ":DICTIONARY:MARKER" (side of a marker in squares) if these are not
+    4X4_50 and 0.75; empty: the chessboard that most pictures show. The mount is that of `model`.
+    Raises NoBoard.
     """
     pictures = [(path, *_read(path)) for path in paths]
     sizes = {grey.shape for _, grey, _ in pictures if grey is not None}
@@ -122,7 +126,7 @@ def _read(path: Path) -> tuple[Picture | None, str]:
 def _find(
     pictures: Sequence[tuple[Path, Picture | None, str]], board: str
 ) -> tuple[str, dict[Path, tuple[Corners, Corners]], tuple[int, int]]:
-    """The board's name, the corners by picture, and the pictures' size."""
+    """Name of the board, corners by picture, and size of the pictures."""
     greys = {path: grey for path, grey, _ in pictures if grey is not None}
     if not greys:
         raise NoBoard(f"none of {len(pictures)} pictures can be read: {pictures[0][2]}")
@@ -135,7 +139,7 @@ def _find(
 
 
 def _recognised(greys: Sequence[Picture]) -> str:
-    """The chessboard that most pictures show; a part of it may be hidden in some."""
+    """The chessboard that most pictures show; a part of it may be hidden in some pictures."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     counts: Counter[tuple[int, int]] = Counter()
     for grey in greys:
@@ -181,7 +185,7 @@ def _finder(board: str) -> Finder:
 
 
 def _chessboard(grey: Picture, shape: tuple[int, int]) -> tuple[Corners, Corners] | None:
-    """By OpenCV's detector of sectors (Duda and Frese 2018), subpixel-exact."""
+    """Corners by OpenCV's detector of sectors (Duda and Frese 2018), with subpixel accuracy."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     seen, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not seen:
@@ -240,7 +244,8 @@ def _projection(fisheye: bool) -> Callable[..., Any]:
 
 
 def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """Error px, matrix, coefficients, turns and moves of the boards, deviation of fy."""
+    """Error in px, matrix, coefficients, rotations and translations of the boards, deviation of
+    fy."""
     flags = cv2.CALIB_FIX_K3 if len(pairs) < FEW else 0
     boards, corners = ([pair[k] for pair in pairs] for k in range(2))
     *found, deviations, _, _ = cv2.calibrateCameraExtended(
@@ -250,7 +255,7 @@ def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
 
 
 def _fisheye(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """As `_usual`; OpenCV gives no deviations, 0 stands for them."""
+    """As `_usual` for a fisheye lens; OpenCV gives no deviations, so that of fy is 0."""
     names: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, 5
     found = cv2.fisheye.calibrate(
         [board.reshape(1, -1, 3).astype(np.float64) for board, _ in pairs],

@@ -1,4 +1,4 @@
-"""`mtlnet calibrate drive.mp4`: the camera of a film, or of pictures of a drive in a row."""
+"""`mtlnet calibrate drive.mp4`: the camera of a film, or of consecutive pictures of a drive."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,27 +13,27 @@ from mtlnet.calibration.film import DriveCalibration, DriveEstimate
 from mtlnet.calibration.lens import Lens
 from mtlnet.calibration.mount import NotCalibrated
 from mtlnet.inference.image_decoding.decode import read_whole_image
-from mtlnet.predict.films import Film, read_film_header
+from mtlnet.sources.films import Film, read_film_header
 from trackfeatures.errors import UserError
 
 LONGEST_S = 120.0
-"""Of a film; the rest is not read."""
+"""Maximum duration of a film that is read, s."""
 DEFAULT_FPS = 25.0
 PICTURE_S = 1.0
-"""Between pictures in a row whose times are not known: no motion is followed."""
+"""Time between consecutive pictures with unknown times, s: too long to follow points."""
 SHOWN = 6
-"""Pictures kept for the page."""
+"""Number of pictures kept for the page."""
 
 Picture = NDArray[np.uint8]
 MakeLens = Callable[[tuple[int, int]], Lens]
-"""The lens of pictures of this width and height."""
+"""Returns the lens of pictures of this size (width, height)."""
 Report = Callable[[float, float], None]
-"""Takes the seconds done and in all."""
+"""Takes the seconds done and the total."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What was found, some of the pictures, and what was wrong with the film, if anything."""
+    """The estimate, some of the pictures, and what was wrong with the film (empty: nothing)."""
 
     found: DriveEstimate
     shown: list[Picture]
@@ -47,8 +47,8 @@ def calibrate_film(
     report: Report = lambda done, total: None,
     longest_s: float = LONGEST_S,
 ) -> Drive:
-    """The camera that filmed `path`, from its first two minutes. Raises NotCalibrated; UserError
-    for a file that is no film."""
+    """The camera that filmed `path`, from at most its first two minutes. Raises NotCalibrated, or
+    UserError for a file that is not a film."""
     header = read_film_header(path)
     fps = header.fps or DEFAULT_FPS
     total = min(header.count / fps, longest_s) if header.count else longest_s
@@ -78,7 +78,7 @@ def calibrate_pictures(
     lane_width_m: float | None = None,
     report: Report = lambda done, total: None,
 ) -> Drive:
-    """The camera that took these pictures of a drive, in their order. Raises NotCalibrated."""
+    """The camera that took these pictures of a drive, in this order. Raises NotCalibrated."""
 
     def timed() -> Iterator[tuple[float, Picture]]:
         for number, path in enumerate(paths):

@@ -1,4 +1,4 @@
-"""A camera's mount from the pictures of a drive, one after the other: films and streams alike.
+"""Estimates a camera's mount from consecutive pictures of a drive, of a film or a stream.
 
 calibration = DriveCalibration(lens)
 for picture, time_s in pictures:
@@ -25,20 +25,21 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 LANE_WIDTH_M = 3.6
-"""Assumed where none is given."""
+"""Lane width assumed if none is given, m."""
 LANE_WIDTH_STD_M = 0.25
 MAX_STD_DEG = 1.0
-"""Of pitch and yaw, the lens apart: a drive that shows them less well shows none."""
+"""Maximum standard deviation of pitch and yaw, degrees, without that of the lens; a drive with a
+larger one is refused."""
 LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
-"""Between the pictures whose markings are used."""
+"""Time between the pictures whose markings are used, s."""
 FOLLOW_S = (0.09, 0.25)
-"""Between two pictures in which points are followed."""
+"""Limits of the time between two pictures in which points are followed, s."""
 KEPT = 600
-"""Pictures that count: of a stream the latest two minutes."""
+"""Maximum number of pictures that are kept: of a stream the latest two minutes."""
 FIRST_LOOK = 25
-"""Pictures after which the horizon, of which the markings' width in the picture depends, is
-known roughly."""
+"""Number of pictures after which the horizon is roughly known; the width of markings in the picture
+depends on it."""
 WORKING_WIDTH = 640
 TRACK_NOISE_PX = 0.2
 MOTION_ROUNDS = 2
@@ -46,7 +47,7 @@ MOTION_ROUNDS = 2
 
 @dataclass(frozen=True)
 class DriveEstimate:
-    """The camera, and how sure its mount is: standard deviations in degrees and m."""
+    """The camera, with standard deviations of its mount in degrees and m."""
 
     camera: CameraParameters
     pitch_std_deg: float
@@ -57,10 +58,10 @@ class DriveEstimate:
     lane_width_m: float
     lane_width_given: bool
     pictures: int
-    """That show the lane's markings on straight road."""
+    """Number of pictures that show the lane's markings on straight road."""
 
     def about(self) -> str:
-        """One line for people."""
+        """The estimate as one line of text."""
         camera = self.camera
         assumed = "given" if self.lane_width_given else "assumed"
         return (
@@ -73,7 +74,7 @@ class DriveEstimate:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """What was found with its standard deviations, by name and unit."""
+        """The estimate with its standard deviations, by name and unit."""
         camera = self.camera
         return {
             "pitch_deg": camera.pitch_deg,
@@ -94,10 +95,10 @@ class DriveEstimate:
 
 
 class DriveCalibration:
-    """Takes pictures of a drive and estimates the mount of the camera that took them.
+    """Collects pictures of a drive and estimates the mount of their camera.
 
-    `lens`: its place x, y in the car is kept, its height and angles are found. A lane width that is
-    not given is assumed.
+    `lens`: its place x, y in the car is kept; height and angles are estimated. A lane width is
+    assumed if none is given.
     """
 
     def __init__(self, lens: Lens, lane_width_m: float | None = None) -> None:
@@ -120,8 +121,8 @@ class DriveCalibration:
         return len(self._samples)
 
     def add(self, picture: NDArray[np.uint8], time_s: float, *, bgr: bool = False) -> None:
-        """Take a picture (H, W, 3), RGB or BGR, of the lens, at any size of its aspect; most are
-        passed over. Times rise."""
+        """Add a picture (H, W, 3), RGB or BGR, of the lens at any size of its aspect ratio. Most
+        pictures are skipped. Times must increase."""
         if time_s >= self._next_s:
             self._next_s = max(self._next_s + SAMPLE_S, time_s + SAMPLE_S / 2)
             small = self._resized(picture, bgr)
@@ -140,7 +141,7 @@ class DriveCalibration:
                     self._tracks.append((begin, time_s - begin, self._normalised_tracks(tracks)))
 
     def estimate(self) -> DriveEstimate:
-        """The camera as the pictures so far show it. Raises NotCalibrated."""
+        """The camera estimated from the pictures so far. Raises NotCalibrated."""
         width = self._lane_width_m
         start = find_vanishing_point(sample.lines for sample in self._samples)
         if start is None:
@@ -165,7 +166,8 @@ class DriveCalibration:
         return self._estimate(mount)
 
     def _motions(self, start: tuple[float, float]) -> list[TimedMotion]:
-        """All motions, each from the guess that it goes where most of them go."""
+        """All motions, each estimated from the starting point that it has the direction of most
+        motions."""
         noise, towards = TRACK_NOISE_PX / self._view.focal_px, np.array(start)
         motions: list[TimedMotion] = []
         for _ in range(MOTION_ROUNDS):
@@ -176,7 +178,7 @@ class DriveCalibration:
         return motions
 
     def _estimate(self, mount: Mount) -> DriveEstimate:
-        """The mount as a camera's. An error of the focal length scales angles."""
+        """The estimate for a mount. An error of the focal length scales the angles."""
         lens, given = self._lens, self._lane_width_m is not None
         camera = replace(
             lens.camera,
@@ -199,7 +201,7 @@ class DriveCalibration:
         )
 
     def _resized(self, picture: NDArray[np.uint8], bgr: bool) -> NDArray[np.uint8]:
-        """RGB, in the size that is worked on."""
+        """The picture in RGB, at the working size."""
         size = (self._view.width, self._view.height)
         if picture.shape[1::-1] != size:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
@@ -221,14 +223,14 @@ class DriveCalibration:
 
 
 def check_lane_width(lane_width_m: float | None) -> None:
-    """Raises UserError for a width that no lane has."""
+    """Raise UserError for a width that no lane has."""
     low, high = LANE_WIDTHS_M
     if lane_width_m is not None and not low <= lane_width_m <= high:
         raise UserError(f"--lane-width {lane_width_m:g} m; give {low:g} to {high:g} m")
 
 
 def normalised(segments: Segments, view: CameraParameters) -> Lines:
-    """`segments` as the straight lines between the rays of their ends."""
+    """`segments` as straight lines between the rays of their ends."""
     half = 0.5 * segments.rows
     ends = [
         view.rays(

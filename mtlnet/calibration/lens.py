@@ -1,4 +1,5 @@
-"""The lens of a camera before its mount is found: given, from a photo's EXIF, or guessed."""
+"""The lens of a camera before its mount is estimated: given, from the EXIF of a photo, or
+guessed."""
 
 from dataclasses import dataclass, replace
 from math import atan, degrees, hypot, radians, tan
@@ -10,18 +11,21 @@ from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 
 GUESSED_FOV_DEG = 65.0
-"""Along the longer side: a phone's usual lens films 55 to 70, a dash camera 70 and more."""
+"""Guessed field of view along the longer side, degrees: a phone's main lens films 55 to 70, a dash
+camera 70 and more."""
 GUESSED_STD, PHOTO_STD = 0.2, 0.05
-"""Standard deviations of the focal length, as shares; a phone crops its films a little."""
+"""Relative standard deviations of the focal length: guessed, and from a photo; phones crop their
+films a little."""
 FILM_DIAGONAL_MM = 43.27
-"""Of 36 x 24 mm, which EXIF's focal length in 35 mm film is measured by (CIPA DC-008)."""
+"""Diagonal of 36 x 24 mm film, the reference of EXIF's 35 mm focal length (CIPA DC-008)."""
 EXIF_DIRECTORY, FOCAL_35MM = 0x8769, 0xA405
 HEAD_BYTES = 1 << 17
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Size and lens; `std`: of the focal length, as a share; `about`: where it is from."""
+    """A camera's size and lens. `std`: relative standard deviation of the focal length; `about`:
+    its origin, in words."""
 
     camera: CameraParameters
     std: float
@@ -35,8 +39,11 @@ def find_lens(
     fov_y_deg: float | None = None,
     photo: Path | None = None,
 ) -> Lens:
-    """The lens of pictures of `size` (width, height): `given`, of this field of view, as wide as
-    that of `photo`, or a guess. Its place in the car is the model's. Raises UserError."""
+    """The lens of pictures of `size` (width, height).
+
+    It is `given`, or has this field of view, or that of `photo`, or a guessed one. Its place in the
+    car is the model's. Raises UserError.
+    """
     width, height = size
     if given is not None:
         if abs(given.width * height - given.height * width) > 0.01 * given.width * height:
@@ -63,8 +70,8 @@ def find_lens(
 
 
 def photo_focal_share(path: Path) -> float:
-    """The focal length of a JPEG photo's lens as a share of the picture's longer side, from its
-    EXIF. Raises UserError."""
+    """Focal length of a JPEG photo relative to the picture's longer side, from its EXIF. Raises
+    UserError."""
     picture = read_whole_image(path)
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)

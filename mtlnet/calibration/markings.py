@@ -1,8 +1,8 @@
-"""Bright or yellow bars in the rows of a road picture, and the segments they form.
+"""Finds bright or yellow bars in the rows of a road picture, and the segments that they form.
 
-At a constant row a marking is as wide as its paint in units of the camera's height, times the rows
-below the horizon, whatever its direction. Pixels, u to the right, v down, pixel centres at whole
-numbers.
+In a row, the width of a marking is that of its paint, in units of the camera's height, times the
+number of rows below the horizon, whatever its direction. Pixels: u to the right, v down, pixel
+centres at whole numbers.
 """
 
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_WIDTH = 0.3
-"""Of a bar, in rows below the horizon: paint of 0.36 m under a camera at 1.2 m."""
+"""Maximum width of a bar, in rows below the horizon: paint of 0.36 m for a camera at 1.2 m."""
 MARGIN_PX = 2.0
 MIN_CONTRAST = 14.0
-"""Grey levels that a bar is brighter (or yellower) than both its sides."""
+"""Least difference in grey levels by which a bar is brighter (or yellower) than both its sides."""
 BAND_PX = 20
-"""Rows of a segment at most: short enough to be straight in a bend."""
+"""Maximum number of rows of a segment, short enough to be straight in a bend."""
 MIN_ROWS = 6
 MAX_RESIDUAL_PX = 1.0
 
@@ -26,7 +26,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Segments:
-    """Pieces of bars (N,): their middle u, v, slope du/dv with its standard deviation, and rows."""
+    """Segments of bars (N,): middle u, v; slope du/dv with its standard deviation; number of
+    rows."""
 
     u: FloatArray
     v: FloatArray
@@ -39,7 +40,8 @@ class Segments:
 
 
 def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
-    """The segments of bars below `horizon_px` (a guess, for their width) in an RGB picture."""
+    """The segments of bars in an RGB picture below row `horizon_px`, a guess that sets their
+    width."""
     height = len(picture)
     top = int(np.clip(horizon_px + 0.02 * height, 0, height - MIN_ROWS))
     below = cv2.GaussianBlur(picture[top:], (3, 3), 0.0).astype(np.float32)
@@ -51,7 +53,7 @@ def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
 
 
 def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
-    """How much brighter a pixel is than the brighter one of those `reach` (rows,) px beside it."""
+    """Difference of each pixel to the brighter of the two pixels `reach` (rows,) px beside it."""
     width = level.shape[1]
     columns = np.arange(width)
     shift = np.rint(reach).astype(np.int64)[:, None]
@@ -63,13 +65,13 @@ def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
 
 
 def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Segments:
-    """Bars of `response` that continue over rows, one straight line each."""
+    """Bars of `response` that continue over several rows, each as a straight line."""
     noise = 1.4826 * float(np.median(np.abs(response)))
     mask = response > max(MIN_CONTRAST, 2.0 * noise)
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     v, u = np.nonzero(mask)
     weight = response[v, u].astype(np.float64)
-    # One centre a row and component: sums over its pixels.
+    # One centre per row and component: sums over its pixels.
     key, place = np.unique(labels[v, u].astype(np.int64) * len(response) + v, return_inverse=True)
     total = np.bincount(place, weight)
     centre = np.bincount(place, weight * u) / total
@@ -83,8 +85,7 @@ def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Seg
 
 
 def _fit_lines(piece: NDArray[np.int64], v: NDArray[np.int64], u: FloatArray) -> Segments:
-    """Least squares of u over v for each `piece`; those that are short or not straight are left
-    out."""
+    """Least squares of u over v for each `piece`; short and curved pieces are left out."""
     n = np.bincount(piece).astype(np.float64)
     mean_u, mean_v = np.bincount(piece, u) / n, np.bincount(piece, v) / n
     du, dv = u - mean_u[piece], v - mean_v[piece]

@@ -1,7 +1,7 @@
 """The camera's rotation and direction of travel between two pictures, from followed points.
 
-Camera frame: x right, y down, z ahead. With a small rotation `w` and travel along T, the ray
-p = (x, y, 1) of a point at rest moves by v so that (T x p) . (v + w x p) = 0, whatever its distance
+Camera frame: x right, y down, z ahead. For a small rotation `w` and travel along T, the ray p = (x,
+y, 1) of a point at rest moves by v with (T x p) . (v + w x p) = 0, whatever its distance
 (Longuet-Higgins and Prazdny 1980).
 """
 
@@ -20,9 +20,9 @@ MIN_SPREAD_PX = 8
 WINDOW = (21, 21)
 LEVELS = 4
 MAX_RETURN_PX = 0.5
-"""A point followed forth and back comes back to its place."""
+"""Maximum distance between a point and its place after it was followed forward and back."""
 BONNET = 0.12
-"""Share of rows at the bottom that are not looked at."""
+"""Share of rows at the bottom that are ignored (the car's bonnet)."""
 ROUNDS = 8
 MIN_MOTION_PX = 0.5
 MAX_CONDITION = 1e12
@@ -30,8 +30,8 @@ MAX_CONDITION = 1e12
 
 @dataclass(frozen=True)
 class Motion:
-    """Between two pictures: rotation of the camera (3,) rad, and where it travels to, x and y in
-    normalised coordinates."""
+    """Motion between two pictures: rotation of the camera (3,) rad, and the point that it travels
+    to, x and y in normalised coordinates."""
 
     rotation: FloatArray
     towards: FloatArray
@@ -39,8 +39,8 @@ class Motion:
 
 
 def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | None:
-    """Places u, v in both of two grey pictures (N, 4); None where too few points can be followed
-    or nothing moves."""
+    """Points u, v in both of two grey pictures (N, 4); None where too few points can be followed or
+    nothing moves."""
     seen = np.full(before.shape, 255, np.uint8)
     seen[round((1 - BONNET) * len(seen)) :] = 0
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)
@@ -58,7 +58,8 @@ def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | 
 
 
 def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> tuple[Any, Any]:
-    """Where points (N, 1, 2) are in `after`, and which were found (N, 1), by Lucas and Kanade."""
+    """Positions of points (N, 1, 2) in `after`, and which were found (N, 1), by Lucas and
+    Kanade."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, np.empty_like(points), winSize=WINDOW, maxLevel=LEVELS
     )
@@ -66,8 +67,8 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> t
 
 
 def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion | None:
-    """Motion from normalised `tracks` (N, 4), starting from a guess of where the camera travels
-    to (2,); `noise`: of a track, in normalised coordinates."""
+    """Motion from normalised `tracks` (N, 4), starting from a guess (2,) of the point that the
+    camera travels to; `noise`: of a track, in normalised coordinates."""
     n = len(tracks)
     p = np.column_stack([0.5 * (tracks[:, :2] + tracks[:, 2:]), np.ones(n)])
     v = np.column_stack([tracks[:, 2:] - tracks[:, :2], np.zeros(n)])
@@ -84,11 +85,13 @@ def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion
         design = np.concatenate([by_rotation, by_heading], axis=1) / length[:, None]
         scale = max(1.4826 * float(np.median(np.abs(error))), noise) if step else scale
         weight = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2) ** 2
-        held = np.diag([0.0, 0.0, 0.0, *(2 * [(scale / 0.05) ** 2])])  # a guess to 3 degrees
+        held = np.diag(
+            [0.0, 0.0, 0.0, *(2 * [(scale / 0.05) ** 2])]
+        )  # the guess holds to 3 degrees
         system = design.T @ (weight[:, None] * design) + held
         pull = held[3:, 3:] @ (heading[:2] - towards)
         right = -design.T @ (weight * error) - np.concatenate([np.zeros(3), pull])
-        if not np.linalg.cond(system) < MAX_CONDITION:  # as of points all in one place
+        if not np.linalg.cond(system) < MAX_CONDITION:  # for example if all points are in one place
             return None
         change = np.linalg.solve(system, right)
         rotation += change[:3]

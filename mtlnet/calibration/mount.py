@@ -1,8 +1,8 @@
-"""A camera's mount from what many pictures of a drive show: robust means and their spread.
+"""Estimates a camera's mount from many pictures of a drive: robust means and their spread.
 
 Pitch and yaw come from the vanishing point of the markings on straight road, and from the point
-that the camera travels to; roll from lanes that stay as wide when the car moves within them; height
-from the lane's width. Bends, hills and the driver's corrections average out.
+that the camera travels to; roll from the lane's width, which must not depend on the car's position
+in the lane; height from the lane's width. Bends, hills and the driver's corrections average out.
 """
 
 from collections.abc import Sequence
@@ -19,24 +19,25 @@ from trackfeatures.errors import UserError
 FloatArray = NDArray[np.float64]
 
 MIN_PICTURES = 12
-"""That show the lane's two markings on straight road."""
+"""Least number of pictures that show the lane's two markings on straight road."""
 STRAIGHT = 0.002
-"""Of a fit's bend: a radius of 300 m and more under a camera at 1.2 m."""
+"""Maximum bend of a fit on straight road: a radius of at least 300 m for a camera at 1.2 m."""
 HEIGHTS_M = (0.7, 3.0)
 LANE_SPREAD = 0.08
-"""Share by which a lane's width differs from its usual one, at most."""
+"""Maximum relative difference of a lane's width from its usual one."""
 OWN_LANE_STD, OWN_LANE_REPEAT = 0.015, 3.0
-"""Of the car's own lane's width in a picture, as a share; so many pictures in a row err alike."""
+"""Relative standard deviation of the own lane's width in a picture; number of consecutive pictures
+with similar errors."""
 NEXT_LANES_ROLL_STD = np.radians(1.0)
-"""Of the roll by which the next lanes are as wide as the car's own: roads fall off to both sides,
-and lanes differ in width."""
+"""Standard deviation of the roll that makes the next lanes as wide as the own one: roads fall off
+to both sides, and lanes differ in width."""
 MIN_SLOPE = 0.25
-"""A car nearer to a marking is changing lanes."""
+"""Least slope of a marking beside the own lane; a car nearer to a marking is changing lanes."""
 ROLL_PRIOR = np.radians(2.0)
 FLOOR = np.radians(0.1)
-"""Standard deviation of the car itself: its springs, and how straight it runs."""
+"""Standard deviation that the car itself adds: its springs, and how straight it runs."""
 MAX_TURN = 0.06
-"""rad/s, above which the travel's direction is not that of the car."""
+"""Rate of turn, rad/s, above which the direction of travel is not that of the car."""
 WINDOW_S = 0.65
 MAX_GAP_S = 0.5
 MIN_SPEEDS = 25
@@ -44,12 +45,12 @@ ROLL_ROUNDS = 3
 
 
 class NotCalibrated(UserError):
-    """A drive that does not show how the camera is mounted."""
+    """The drive does not show how the camera is mounted."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The segments of one picture, and its time in s."""
+    """Segments of one picture, and its time in s."""
 
     time_s: float
     lines: Lines
@@ -57,7 +58,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class TimedMotion:
-    """Motion between two pictures `seconds` apart."""
+    """Motion between two pictures, `seconds` apart."""
 
     time_s: float
     seconds: float
@@ -66,7 +67,8 @@ class TimedMotion:
 
 @dataclass(frozen=True)
 class Mount:
-    """Angles in rad and height in m with their standard deviations; `pictures` used of all."""
+    """Angles in rad and height in m with their standard deviations; number of pictures and motions
+    used."""
 
     pitch: float
     yaw: float
@@ -82,7 +84,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class _Roads:
-    """Fits (N,) as columns. `lane`: of the car's lane, the difference of its markings' slopes."""
+    """Fits (N,) as columns. `lane`: difference of the slopes of the own lane's two markings."""
 
     time_s: FloatArray
     x0: FloatArray
@@ -91,9 +93,10 @@ class _Roads:
     bend: FloatArray
     lane: FloatArray
     sideways: FloatArray
-    """Speed to the right, in heights of the camera a second; NaN where it is not known."""
+    """Speed to the right, in camera heights per second; NaN where unknown."""
     widths: FloatArray
-    """Of all lanes (M, 4): fit, difference of slopes, their mean, 1 for the car's own lane."""
+    """Widths of all lanes (M, 4): index of the fit, difference of slopes, their mean, 1 for the own
+    lane."""
 
 
 def find_mount(
@@ -103,7 +106,7 @@ def find_mount(
     lane_width_m: float,
     lane_width_std_m: float,
 ) -> Mount:
-    """The mount; `start`: the film's vanishing point, in normalised coordinates. Raises
+    """The mount; `start`: the film's vanishing point in normalised coordinates. Raises
     NotCalibrated."""
     roll, level = 0.0, start
     for _ in range(ROLL_ROUNDS):
@@ -148,8 +151,8 @@ def _straight(roads: _Roads) -> NDArray[np.bool_]:
 
 
 def _lane_widths(fits: Sequence[RoadFit], lane_width_m: float) -> FloatArray:
-    """Widths of the lanes between markings side by side, as in `_Roads.widths`, where they are
-    nearly as the car's own lane usually is."""
+    """Widths of the lanes between neighbouring markings, as in `_Roads.widths`, that are close to
+    the usual width of the own lane."""
     rows = []
     for k, fit in enumerate(fits):
         for left, right in zip(fit.slopes[:-1], fit.slopes[1:], strict=True):
@@ -166,8 +169,8 @@ def _lane_widths(fits: Sequence[RoadFit], lane_width_m: float) -> FloatArray:
 
 
 def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
-    """Slope of `place` (N,) over `time` within WINDOW_S; NaN where too little is known, or the car
-    takes another lane."""
+    """Slope of `place` (N,) over `time` within WINDOW_S; NaN where too little is known or the car
+    changes lanes."""
     found = np.full(len(time), np.nan)
     for k in range(len(time)):
         near = (np.abs(time - time[k]) <= WINDOW_S) & np.isfinite(place)
@@ -181,10 +184,10 @@ def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
 
 
 def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
-    """What is to be added to `roll` so that lanes are as wide wherever the car is, and the standard
-    deviation of the sum.
+    """The correction of `roll` that makes the lane's width independent of the car's position in the
+    lane, and the standard deviation of the corrected roll.
 
-    A roll r widens a lane whose markings' slopes have the mean c by 1 + 2 r c.
+    A roll r widens a lane by 1 + 2 r c, where c is the mean slope of its two markings.
     """
     found, weight = [-roll], [ROLL_PRIOR**-2]
     own = widths[widths[:, 3] == 1]
@@ -204,13 +207,13 @@ def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
 
 
 def _vanishing_point(roads: _Roads, rows: NDArray[np.int64]) -> tuple[float, float]:
-    """x0, y0 of straight road as seen by a car that moves along it."""
+    """Vanishing point x0, y0 of straight road for a car that moves along it."""
     weight = 1.0 / (roads.y0_std[rows] ** 2 + 0.004**2)
     y0 = robust.mean(roads.y0[rows], weight)
     speeds = np.isfinite(roads.sideways[rows])
     if speeds.sum() < MIN_SPEEDS:
         return robust.mean(roads.x0[rows]), y0
-    # A car that points to the right of the road moves to the right; in a bend it points inwards.
+    # A car that points to the right of the road moves to the right. In a bend it points inwards.
     side, bend = roads.sideways[rows][speeds], roads.bend[rows][speeds] / STRAIGHT
     design = np.column_stack([np.ones(len(side)), side, bend])
     return float(robust.fit(design, roads.x0[rows][speeds], np.ones(len(side)))[0]), y0
@@ -262,8 +265,8 @@ def _combine(
 def _travel(
     motions: Sequence[TimedMotion], roll: float, rng: np.random.Generator
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Where the camera travels to while the car runs straight ahead, level x and y, and their
-    standard deviations."""
+    """The point that the camera travels to while the car runs straight ahead, level x and y, and
+    their standard deviations."""
     level = [m for m in motions if np.abs(m.motion.rotation[1]) < MAX_TURN * m.seconds]
     if len(level) < MIN_PICTURES:
         return None
@@ -272,7 +275,7 @@ def _travel(
     c, s = np.cos(roll), np.sin(roll)
     towards = towards @ np.array([[c, s], [-s, c]])
 
-    # In a bend the camera, ahead of the rear axle, travels outwards of where the car points.
+    # In a bend the camera, ahead of the rear axle, travels to the outside of the car's direction.
     turn = np.array([m.motion.rotation[1] / m.seconds for m in level]) / MAX_TURN
     design = np.column_stack([np.ones(len(turn)), turn])
 
@@ -287,7 +290,8 @@ def _travel(
 
 
 def _weighted(values: list[float], stds: list[float]) -> tuple[float, float]:
-    """The mean by inverse variance, FLOOR added; its standard deviation covers their difference."""
+    """Mean weighted by inverse variance, with FLOOR added; its standard deviation covers the
+    values' difference."""
     weight = np.array([1.0 / (std**2 + FLOOR**2) for std in stds])
     found = float(np.dot(weight, values) / weight.sum())
     return found, float(max(weight.sum() ** -0.5, np.ptp(values) / 2))

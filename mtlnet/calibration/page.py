@@ -1,4 +1,4 @@
-"""The page of a calibration: a board's corners, or the lane as the camera should see it."""
+"""The HTML page of a calibration: corners of a board, or a lane as the camera should see it."""
 
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,17 @@ from runtime.html import embed_jpeg, render
 from trackfeatures.camera import CameraParameters
 
 WIDTH = 640
-"""Of the pictures on the page, px."""
+"""Width of the pictures on the page, px."""
 SEEN, PROJECTED, LANE, HORIZON = (0, 200, 60), (255, 60, 0), (255, 120, 0), (0, 160, 255)
 ERROR_SCALE = 20.0
-"""Errors are drawn so many times as long."""
+"""Factor by which errors are drawn longer."""
 LANE_AHEAD_M = np.linspace(3.0, 60.0, 120)
 
 Picture = NDArray[np.uint8]
 
 
 def write_board_page(path: Path, found: BoardCalibration) -> None:
-    """Each picture with its corners and its error."""
+    """Write the page of a board: each picture with its corners and its error."""
     figures = [
         {"jpeg": embed_jpeg(draw_corners(picture)), "title": picture.path.name, "text": about}
         for picture in found.pictures
@@ -60,7 +60,7 @@ def _lens_lines(found: BoardCalibration) -> list[str]:
 
 
 def draw_corners(picture: BoardPicture) -> Picture:
-    """The picture at `WIDTH` with its corners, and their errors where it was used."""
+    """The picture at `WIDTH` with its corners, and their errors if it was used."""
     image = read_whole_image(picture.path)
     scale = WIDTH / image.shape[1]
     image = _scaled(image, scale)
@@ -75,7 +75,7 @@ def draw_corners(picture: BoardPicture) -> Picture:
 
 
 def write_drive_page(path: Path, drive: Drive, name: str) -> None:
-    """Pictures of the drive with the horizon and the markings of a straight lane drawn in."""
+    """Write the page of a drive: pictures with the horizon and the markings of a straight lane."""
     found = drive.found
     std = [found.pitch_std_deg, found.yaw_std_deg, found.roll_std_deg, found.height_std_m]
     camera = found.camera
@@ -94,7 +94,7 @@ def write_drive_page(path: Path, drive: Drive, name: str) -> None:
                 for what, value, spread in zip(names, values, std, strict=True)
             ],
             note="The horizon (blue), and a straight lane of the stated width with the car in its "
-            "middle (orange). Beside the real markings it should be parallel to them.",
+            "middle (orange). Its lines should be parallel to the real markings.",
             figures=[
                 {
                     "jpeg": embed_jpeg(draw_lane(p, camera, found.lane_width_m)),
@@ -108,7 +108,7 @@ def write_drive_page(path: Path, drive: Drive, name: str) -> None:
 
 
 def draw_lane(picture: Picture, camera: CameraParameters, lane_width_m: float) -> Picture:
-    """The picture at `WIDTH` with the horizon and a straight lane."""
+    """The picture at `WIDTH` with the horizon and a straight lane drawn in."""
     image = _scaled(picture, WIDTH / picture.shape[1])
     camera = camera.resized(image.shape[1], image.shape[0])
     road = -camera.cg_height_m

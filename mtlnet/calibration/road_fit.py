@@ -1,9 +1,9 @@
-"""The road's vanishing point, its bend and the slopes of its markings, from one picture's segments.
+"""The road's vanishing point, bend and slopes of markings, from the segments of one picture.
 
 Normalised image coordinates x, y: pixels from the principal point divided by the focal length,
-turned level. A marking of a flat road is x = x0 + a s + b / s with s = y - y0 > 0: (x0, y0) is the
-vanishing point at the camera, `a` grows with the marking's lateral offset by
-cos(pitch) / (height cos(heading)), and b = curvature * height / 2 bends all markings alike.
+corrected for roll. A marking of a flat road is x = x0 + a s + b / s with s = y - y0 > 0. Here (x0,
+y0) is the vanishing point at the camera, `a` is the marking's lateral offset divided by height
+cos(heading) / cos(pitch), and b = curvature * height / 2 bends all markings alike.
 """
 
 from dataclasses import dataclass
@@ -14,24 +14,24 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 MIN_BELOW = 0.05
-"""Segments nearer to the horizon are left out: 24 m ahead and more, for a camera at 1.2 m."""
+"""Least distance of a segment below the horizon: at most 24 m ahead for a camera at 1.2 m."""
 MAX_SLOPE = 8.0
 SEARCH = (0.09, 0.07)
-"""Distance of a picture's vanishing point from the film's, at most: in x (heading) and y."""
+"""Maximum distance of a picture's vanishing point from the film's, in x (heading) and y."""
 MIN_CROSSING = 0.8
-"""Difference of slopes of two segments that give a candidate for the vanishing point."""
+"""Least difference of slopes of two segments that give a candidate for the vanishing point."""
 POINTING_STD = 0.008
 MIN_LINE_WEIGHT = 0.05
-"""Height of a marking's segments in all, at least."""
+"""Least total height of the segments of a marking."""
 BEND_STD = 0.004
-"""Prior of b: a radius of 150 m under a camera at 1.2 m."""
+"""Standard deviation of the prior of b: a radius of 150 m for a camera at 1.2 m."""
 MAX_FIT_STD = 0.02
 ROUNDS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Segments (N,) in normalised level coordinates; `size` is the height of each."""
+    """Segments (N,) in normalised coordinates; `size` is the height of each."""
 
     x: FloatArray
     y: FloatArray
@@ -40,15 +40,15 @@ class Lines:
     size: FloatArray
 
     def chosen(self, rows: NDArray[np.bool_]) -> "Lines":
-        """The segments of a mask (N,)."""
+        """The segments selected by a mask (N,)."""
         return Lines(
             self.x[rows], self.y[rows], self.slope[rows], self.slope_std[rows], self.size[rows]
         )
 
     def turned(self, roll: float) -> "Lines":
-        """As a camera without the roll (rad) of this one sees them."""
+        """The segments as seen by a camera without the roll (rad) of this one."""
         c, s = np.cos(roll), np.sin(roll)
-        along = c + self.slope * s  # of (slope, 1), turned: its part down
+        along = c + self.slope * s  # the vertical part of (slope, 1) after the rotation
         return Lines(
             self.x * c - self.y * s,
             self.x * s + self.y * c,
@@ -60,7 +60,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class RoadFit:
-    """What one picture shows; standard deviations are those of the fit alone."""
+    """Result for one picture; standard deviations are those of the fit alone."""
 
     x0: float
     y0: float
@@ -68,11 +68,12 @@ class RoadFit:
     x0_std: float
     y0_std: float
     slopes: tuple[float, ...]
-    """Of the markings, leftmost first."""
+    """Slopes of the markings, leftmost first."""
 
 
 def fit_road(lines: Lines, x0: float, y0: float) -> RoadFit | None:
-    """The fit near the film's vanishing point (x0, y0); None where the markings do not give it."""
+    """The fit near the film's vanishing point (x0, y0); None where the markings do not determine
+    it."""
     usable = (lines.y > y0 + MIN_BELOW) & (np.abs(lines.slope) < MAX_SLOPE)
     lines = lines.chosen(usable)
     start = _crossing(lines, x0, y0)
@@ -110,7 +111,7 @@ def _crossing(lines: Lines, x0: float, y0: float) -> tuple[float, float, FloatAr
 
 
 def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray:
-    """Slopes of the markings: means of runs of segments that lie close together."""
+    """Slopes of the markings: means of groups of segments with similar slopes."""
     order = np.argsort(slope)
     slope, std, size = slope[order], std[order], size[order]
     gap = np.diff(slope) > 0.12 + std[1:] + std[:-1]
@@ -122,7 +123,8 @@ def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray
 
 
 def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit | None:
-    """Gauss-Newton over (x0, y0, b, slopes); segments join the marking that they lie on."""
+    """Gauss-Newton over (x0, y0, b, slopes); each segment is assigned to the marking that it lies
+    on."""
     state: FloatArray = np.array([x0, y0, 0.0, *slopes])
     covariance: FloatArray = np.zeros((0, 0))
     for step in range(ROUNDS):
@@ -149,14 +151,16 @@ def _below(lines: Lines, y0: float) -> FloatArray:
 
 
 def _slope_std(lines: Lines, below: FloatArray) -> FloatArray:
-    """Of a segment against its marking: of the segment, and of a road that is not quite flat."""
+    """Standard deviation of a segment's slope against its marking's, including that of an uneven
+    road."""
     return np.asarray(np.hypot(lines.slope_std, 0.02 + 0.004 / below), np.float64)
 
 
 def _members(
     lines: Lines, state: FloatArray, wide: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
-    """Which segments lie on a marking, on which of those that are held, and which are held."""
+    """Which segments lie on a marking, the number of their marking among those kept, and which are
+    kept."""
     x0, y0, bend = state[:3]
     slopes, below = state[3:], _below(lines, y0)
     away = lines.x[:, None] - (x0 + slopes * below[:, None] + bend / below[:, None])
@@ -172,8 +176,8 @@ def _members(
 def _equations(
     lines: Lines, marking: NDArray[np.int64], state: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Design (2 N + 1, P) and errors of the places and slopes of segments, by their standard
-    deviations and Huber's weights; the last row is free."""
+    """Design matrix (2 N + 1, P) and errors of the positions and slopes of segments, divided by
+    their standard deviations and weighted by Huber's weights; the last row is free."""
     x0, y0, bend = state[:3]
     s, a, n = _below(lines, y0), state[3:][marking], len(lines.x)
     own = 3 + marking

@@ -1,4 +1,4 @@
-"""Means, lines and spreads that outliers do not move."""
+"""Means, linear fits and spreads that are robust to outliers."""
 
 from collections.abc import Callable
 
@@ -9,11 +9,11 @@ FloatArray = NDArray[np.float64]
 
 ROUNDS = 12
 TUNING = 1.5
-"""Standard deviations from which an error counts linearly (Huber 1981)."""
+"""Number of standard deviations from which an error counts linearly (Huber 1981)."""
 
 
 def fit(design: FloatArray, values: FloatArray, weight: FloatArray) -> FloatArray:
-    """Coefficients (P,) of `values` (N,) = `design` (N, P) @ coefficients, by Huber's weights."""
+    """Coefficients (P,) of `values` (N,) = `design` (N, P) @ coefficients, with Huber's weights."""
     root = np.sqrt(weight)
     found: FloatArray = np.zeros(design.shape[1])
     scale = root
@@ -39,8 +39,8 @@ def bootstrap_std(
     rng: np.random.Generator,
     draws: int = 60,
 ) -> FloatArray:
-    """Standard deviations of `estimate(rows)` over resampled blocks of rows (Efron 1979); `block`
-    (N,) is each row's block. Half the spread of the middle 68 %."""
+    """Standard deviations of `estimate(rows)` over resampled blocks of rows (Efron 1979): half the
+    spread of the middle 68 %. `block` (N,): the block of each row."""
     rows_of = [np.flatnonzero(block == name) for name in np.unique(block)]
     found = []
     for _ in range(draws):

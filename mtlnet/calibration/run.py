@@ -1,48 +1,30 @@
-"""`mtlnet calibrate`: a camera file from pictures of a board, from a film, or from pictures of a
-drive in a row."""
+"""`mtlnet calibrate`: a camera file from pictures of a board, from a film, or from consecutive
+pictures of a drive."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mtlnet.calibration.board import calibrate_board
+from mtlnet.calibration.config import CalibrateConfig
 from mtlnet.calibration.drive import Drive, Report, calibrate_film, calibrate_pictures
 from mtlnet.calibration.film import check_lane_width
 from mtlnet.calibration.lens import Lens, find_lens
-from mtlnet.predict.kinds import Kind, kind_of
-from mtlnet.predict.sources import find_sources
+from mtlnet.sources.find import find_sources
+from mtlnet.sources.kinds import Kind, kind_of
 from runtime.camera_file import read_camera, write_camera
 from runtime.files import check_folder
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 
-@dataclass(frozen=True)
-class CalibrateConfig:
-    """What `mtlnet calibrate` is given; None and empty where it is not."""
-
-    inputs: Sequence[str]
-    out: Path
-    board: str = ""
-    fisheye: bool = False
-    drive: bool = False
-    """The pictures are of a drive, in their order."""
-    camera: Path | None = None
-    """A file with the lens."""
-    fov_y_deg: float | None = None
-    photo: Path | None = None
-    lane_width_m: float | None = None
-    page: Path | None = None
-
-
 def calibrate(
     config: CalibrateConfig, report: Report = lambda done, total: None
 ) -> tuple[dict[str, Any], str]:
-    """Write the camera file; returns the result, and it in one line.
+    """Write the camera file; returns the result, and a line of text about it.
 
-    Raises UserError, also for a film that breaks off or is damaged: the camera was written then, if
-    what could be read was enough.
+    Raises UserError, also for a film that breaks off or is damaged; if the readable part was
+    sufficient, the camera file has been written.
     """
     check_folder(config.out)
     if config.page is not None:
@@ -76,7 +58,7 @@ def _calibrate_board(config: CalibrateConfig, paths: list[Path]) -> tuple[dict[s
     )
     comment = (
         f"mtlnet calibrate: {line}\nThe mount is assumed; with this file as --camera, "
-        "`mtlnet calibrate drive.mp4` finds it."
+        "`mtlnet calibrate drive.mp4` estimates it."
     )
     write_camera(config.out, camera, comment)
     if config.page is not None:
@@ -116,7 +98,7 @@ def _calibrate_drive(
 
 
 def _with_exif(path: Path) -> Path | None:
-    """The picture, if it states its focal length."""
+    """The picture if its EXIF states the focal length, else None."""
     from mtlnet.calibration.lens import photo_focal_share
 
     try:

@@ -1,6 +1,7 @@
-"""The film's vanishing point to half a degree: the mode of where all segments of markings meet.
+"""The film's vanishing point to half a degree: where most segments of markings intersect.
 
-Bends, lane changes and whatever else is not along the road spread; straight driving adds up.
+Intersections on bends, during lane changes and of objects not along the road are scattered; those
+of straight driving add up.
 """
 
 from collections.abc import Iterable
@@ -12,13 +13,13 @@ from mtlnet.calibration.road_fit import MAX_SLOPE, MIN_BELOW, Lines
 
 STEP_DEG = 0.25
 REACH_DEG = (16.0, 13.0)
-"""Yaw and pitch that are searched, to both sides."""
+"""Range of yaw and pitch that is searched, degrees to both sides."""
 POINTING_STD = 0.01
 SMOOTHING_CELLS = 2.0
 
 
 def find_vanishing_point(pictures: Iterable[Lines]) -> tuple[float, float] | None:
-    """x0, y0 in normalised coordinates; None where no segment points anywhere near."""
+    """x0, y0 in normalised coordinates; None where no segment points into the range."""
     across, down = (np.arange(-reach, reach + STEP_DEG / 2, STEP_DEG) for reach in REACH_DEG)
     y0 = np.tan(np.radians(down))
     votes = np.zeros((len(down), len(across)))

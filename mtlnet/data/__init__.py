@@ -1,1 +1,1 @@
-"""Training data: its sources, batches, and augmentation."""
+"""Data for training and evaluation: rounds, labelled pictures, batches, augmentation."""

@@ -1,12 +1,12 @@
-"""A user's own pictures with a `labels.csv` in memory, as the model's camera would take them:
-`mtlnet train --init RUN`, `mtlnet evaluate`.
+"""A user's own labelled pictures (a folder with `labels.csv`), rectified to the model's camera.
 
-A picture's camera is the file that its row names, else `camera.yaml` in the folder, else the
-model's own. Pictures of another camera are rectified (`mtlnet.inference.rectification`).
+Used by `mtlnet train --init RUN` and `mtlnet evaluate`. The camera of a picture is the camera file
+named in its row, else `camera.yaml` in the folder, else the model's camera. Pictures of another
+camera than the model's are rectified (`mtlnet.inference.rectification`).
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,43 +25,45 @@ from mtlnet.data.picture_copies import PLAIN, copied_camera, copied_label, copie
 from mtlnet.inference.image_decoding.decode import crop_and_resize, read_whole_image
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from mtlnet.inference.rectification import CAMERA_FILE, Rectification, read_camera
+from runtime.files import file_hash
 from trackfeatures.camera import CameraParameters
 from trackfeatures.coding import UNKNOWN_M
 from trackfeatures.errors import UserError
 
 ASPECT_TOLERANCE = 0.01
-MAX_READERS = 8  # threads; each may hold a photo of 0.8 GB
+MAX_READERS = 8  # number of threads; each may hold a photo of 0.8 GB
 
 
 @dataclass(frozen=True)
 class CustomImages:
-    """Labelled pictures, (N, H, W, 3) uint8 of the model camera's size (0.18 MB each).
+    """N labelled pictures in memory, uint8 (N, H, W, 3) at the size of the model's camera (0.18 MB
+    each).
 
-    All sequences have N entries: the pictures, each as it is and as its copies.
+    Each picture and each of its copies is one entry of every sequence.
     """
 
     path: Path
     labels: CustomLabels
-    """As in the file: beside the camera that took the picture."""
+    """Labels as in the file: distances are measured at the camera that took the picture."""
     images: NDArray[np.uint8]
     content_hash: str
     pictures: tuple[LabelledPicture, ...]
     lenses: tuple[Rectification | None, ...]
-    """How each was rectified; None: it is of the model's own camera."""
+    """Rectification of each picture; None where the model's camera took it."""
     copies: tuple[str, ...]
-    """Of `mtlnet.data.picture_copies.COPIES`."""
+    """Kind of each copy, from `mtlnet.data.picture_copies.COPIES`."""
     hashes: tuple[str, ...]
     """SHA-256 of each picture's file."""
     camera: CameraParameters
-    """The model's."""
+    """The model's camera."""
     refused: tuple[tuple[LabelledPicture, str, str], ...] = ()
-    """Picture, copy and reason of each that shows too little of the model's view."""
+    """Picture, kind of copy and reason, for each copy that shows too little of the model's view."""
 
     def __len__(self) -> int:
         return len(self.images)
 
     def take(self, rows: Any) -> "CustomImages":
-        """Some of the pictures, by their numbers or a slice."""
+        """The pictures with these row numbers, or in this slice."""
         chosen = np.arange(len(self))[rows].tolist()
         return replace(
             self,
@@ -80,11 +82,12 @@ class CustomImages:
     def read_batch(
         self, indices: NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """The images of `indices`, (B, H, W, 3), in `out` where one is given."""
+        """Images (B, H, W, 3) of rows `indices`; written to `out` if it is given."""
         return np.take(self.images, indices, axis=0, out=out)
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, 9 to 22) for the images, in metres beside the pictures' cameras."""
+        """A model's outputs (N, 9 to 22) with distances converted to metres at the pictures' own
+        cameras."""
         found = outputs.copy()
         for lens in {lens for lens in self.lenses if lens is not None}:
             rows = [i for i, each in enumerate(self.lenses) if each == lens]
@@ -93,9 +96,10 @@ class CustomImages:
 
     @cached_property
     def for_training(self) -> "CustomImages":
-        """The same with labels in metres beside the model's camera.
+        """The same pictures with labels converted to metres at the model's camera.
 
-        Raises UserError that names the line of a label that the network cannot express there.
+        Raises UserError with the line of a label that is then outside the range of the network's
+        coding.
         """
         distances = self.labels.distances.copy()
         for row, lens in enumerate(self.lenses):
@@ -119,11 +123,12 @@ def open_custom_images(
     *,
     skip_refused: bool = False,
 ) -> CustomImages:
-    """Read the labels and pictures of a folder, each as its `copies`, for a model of `camera`.
+    """Read the labels and pictures of a folder, with the `copies` of each picture, for `camera`.
 
-    Raises UserError that names the faulty line of `labels.csv`, also for a picture that is missing,
-    damaged, or not of its camera's aspect ratio, and for one that shows too little of the model's
-    view: with `skip_refused` these are listed instead.
+    `camera`: the model's camera. Raises UserError with the line of `labels.csv` for a faulty row,
+    for a picture that is missing, damaged or not of its camera's aspect ratio, and for a picture
+    that shows too little of the model's view. With `skip_refused`, pictures of the last kind are
+    listed in `refused` instead.
     """
     path = folder / LABELS
     pictures, labels = read_labels(path)
@@ -131,8 +136,47 @@ def open_custom_images(
     digest = hashlib.sha256(path.read_bytes())
     for name in sorted({*_camera_files(folder, pictures)}):
         digest.update((folder / name).read_bytes())
+    kept: list[tuple[int, str, str]] = []
+    images: list[NDArray[np.uint8]] = []
+    refused: list[tuple[LabelledPicture, str, str]] = []
+    for row, (found, made) in enumerate(
+        _read_pictures(folder, pictures, cameras, camera, copies, skip_refused)
+    ):
+        digest.update(bytes.fromhex(found))
+        for copy, image in zip(copies, made, strict=True):
+            if isinstance(image, ImageError):
+                refused.append((pictures[row], copy, str(image)))
+            else:
+                kept.append((row, copy, found))
+                images.append(image)
+    if not kept:
+        raise UserError(f"{path}: no picture shows enough of the model's view; {refused[0][2]}")
+    chosen = [copied_label(labels, row, cameras[row] or camera, copy) for row, copy, _ in kept]
+    return CustomImages(
+        folder,
+        CustomLabels(*(np.concatenate(column) for column in zip(*chosen, strict=True))),
+        np.stack(images),
+        digest.hexdigest(),
+        tuple(pictures[row] for row, _, _ in kept),
+        tuple(_lens(cameras[row], camera, copy) for row, copy, _ in kept),
+        tuple(copy for _, copy, _ in kept),
+        tuple(found for _, _, found in kept),
+        camera,
+        tuple(refused),
+    )
 
-    def prepare(row: int) -> tuple[str, list[NDArray[np.uint8] | ImageError]]:
+
+def _read_pictures(
+    folder: Path,
+    pictures: Sequence[LabelledPicture],
+    cameras: Sequence[CameraParameters | None],
+    camera: CameraParameters,
+    copies: Sequence[str],
+    skip_refused: bool,
+) -> Iterator[tuple[str, list[NDArray[np.uint8] | ImageError]]]:
+    """Yields, for each picture, the SHA-256 of its file and its copies as seen by `camera`."""
+
+    def read(row: int) -> tuple[str, list[NDArray[np.uint8] | ImageError]]:
         file = folder / pictures[row].file
         try:
             whole = read_whole_image(file)
@@ -141,44 +185,19 @@ def open_custom_images(
             if faults and not skip_refused:
                 raise faults[0]
         except UserError as error:
-            error.args = (f"{path}, line {pictures[row].line}: {error}",)
+            error.args = (f"{folder / LABELS}, line {pictures[row].line}: {error}",)
             raise
-        return hashlib.sha256(file.read_bytes()).hexdigest(), made
+        return file_hash(file), made
 
-    kept: list[tuple[int, str, str]] = []
-    images: list[NDArray[np.uint8]] = []
-    refused: list[tuple[LabelledPicture, str, str]] = []
     with ThreadPoolExecutor(MAX_READERS) as pool:
-        for row, (found, made) in enumerate(pool.map(prepare, range(len(pictures)))):
-            digest.update(bytes.fromhex(found))
-            for copy, image in zip(copies, made, strict=True):
-                if isinstance(image, ImageError):
-                    refused.append((pictures[row], copy, str(image)))
-                else:
-                    kept.append((row, copy, found))
-                    images.append(image)
-    if not kept:
-        raise UserError(f"{path}: no picture shows enough of the model's view; {refused[0][2]}")
-    chosen = [copied_label(labels, row, cameras[row] or camera, copy) for row, copy, _ in kept]
-    lenses = [_lens(cameras[row], camera, copy) for row, copy, _ in kept]
-    return CustomImages(
-        folder,
-        CustomLabels(*(np.concatenate(column) for column in zip(*chosen, strict=True))),
-        np.stack(images),
-        digest.hexdigest(),
-        tuple(pictures[row] for row, _, _ in kept),
-        tuple(lenses),
-        tuple(copy for _, copy, _ in kept),
-        tuple(found for _, _, found in kept),
-        camera,
-        tuple(refused),
-    )
+        yield from pool.map(read, range(len(pictures)))
 
 
 def picture_cameras(
     folder: Path, pictures: Sequence[LabelledPicture], model: CameraParameters
 ) -> list[CameraParameters | None]:
-    """The camera of each picture; None: the model's own. Raises UserError for a faulty file."""
+    """Camera of each picture; None: the model's camera. Raises UserError for a faulty camera
+    file."""
     known: dict[str, CameraParameters] = {}
     found: list[CameraParameters | None] = []
     for picture in pictures:
@@ -230,7 +249,8 @@ def _prepared(
     target: CameraParameters,
     copy: str,
 ) -> NDArray[np.uint8] | ImageError:
-    """A copy of a picture as the model's camera would take it, or why it shows too little."""
+    """One copy of a picture as seen by the model's camera; an ImageError if it shows too little of
+    it."""
     if copy != PLAIN:
         image = copied_picture(image, source or target, copy)
     if source is None:
@@ -245,9 +265,9 @@ def _prepared(
 
 
 def _uncropped(path: Path, image: NDArray[np.uint8], camera: CameraParameters) -> NDArray[np.uint8]:
-    """An image of the camera's aspect ratio, at its size.
+    """An image with the camera's aspect ratio, scaled to its size.
 
-    Unlike images for prediction it is not cropped: its labels belong to the whole image.
+    It is not cropped, unlike images for prediction, because its labels belong to the whole image.
     """
     height, width = image.shape[:2]
     if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:

@@ -1,8 +1,8 @@
-"""A dataset in GPU memory: decoded once, then each batch is an index into it.
+"""A dataset in GPU memory: images are decoded once, and each batch indexes into them.
 
-The batches are those of the loader (`mtlnet.data.loader`), in its order. A training step of the
-paper's network takes a data-centre GPU about a millisecond, less than decoding 32 images on the
-CPU, or augmenting them.
+The batches are those of the loader (`mtlnet.data.loader`), in the same order. A training step of
+the paper's network takes about one millisecond on a data-centre GPU, less than decoding or
+augmenting 32 images on the CPU.
 """
 
 from collections.abc import Iterator
@@ -19,15 +19,15 @@ from mtlnet.data.augment.on_device import DeviceAugment, to_device
 from mtlnet.data.loader import Batch, BatchLabels, Loader, make_ahead
 
 MEMORY_SHARE = 0.6
-"""Largest share of the free GPU memory for the images; the rest is for training."""
+"""Maximum share of the free GPU memory for the images; the rest is for training."""
 CHUNK = 256  # images decoded at once
-DECODED_AHEAD = 3  # chunks decoded or waiting, while one is copied to the device
-PREFETCH = 4  # batches whose labels are made in advance
+DECODED_AHEAD = 3  # chunks decoded ahead while one is copied to the device
+PREFETCH = 4  # batches whose labels are computed in advance
 
 
 @dataclass(frozen=True)
 class DeviceBatch:
-    """A batch on the device: `images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,), `ahead`
+    """A batch on the device: `images` uint8 (B, H, W, 3), `coded` (B, 6), `heading` (B,), `ahead`
     (B, A)."""
 
     images: Tensor
@@ -37,7 +37,7 @@ class DeviceBatch:
 
 
 def on_device(batch: Batch | DeviceBatch, device: torch.device) -> DeviceBatch:
-    """A batch as tensors on `device`."""
+    """The batch as tensors on `device`."""
     if isinstance(batch, DeviceBatch):
         return batch
     arrays = (batch.images, batch.coded, batch.heading, batch.ahead)
@@ -45,10 +45,10 @@ def on_device(batch: Batch | DeviceBatch, device: torch.device) -> DeviceBatch:
 
 
 class GpuDataset:
-    """The frames of `loader` on `device`, and the loader's batches made from them.
+    """The frames of `loader` in the memory of `device`, and the loader's batches made from them.
 
-    Rows above `first_row` are not kept. Augmentation, if the loader asks for it, runs on the device
-    (`mtlnet.data.augment.on_device`), with labels that are made in advance.
+    Rows above `first_row` are not stored. If the loader augments, augmentation runs on the device
+    (`mtlnet.data.augment.on_device`); the labels are computed in advance on the CPU.
     """
 
     def __init__(self, loader: Loader, device: torch.device, first_row: int = 0) -> None:
@@ -66,7 +66,7 @@ class GpuDataset:
         ]
 
     def make(self, step: int) -> DeviceBatch:
-        """This process's rows of batch `step`."""
+        """This process's part of batch number `step`."""
         if self._augment is not None:
             return self._augmented(self._loader.make_labels(step), step)
         rows = self._to_device(self._loader.indices(step)[self._loader.rows])
@@ -75,7 +75,7 @@ class GpuDataset:
         )
 
     def batches(self, first: int) -> Iterator[DeviceBatch]:
-        """Batches `first`, `first` + 1, ... without end."""
+        """Yields batches `first`, `first` + 1, ... without end."""
         if self._augment is None:
             return map(self.make, count(first))
         labels = make_ahead(self._loader.make_labels, first, PREFETCH, PREFETCH)
@@ -105,7 +105,7 @@ def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
         return loader.frames.read_batch(rows, np.empty((len(rows), *size), np.uint8))
 
     firsts = range(0, number, CHUNK)
-    # Two chunks at a time keep every core busy to the end of each.
+    # Two chunks at a time: all cores stay busy while one chunk ends.
     chunks = make_ahead(decode, 0, DECODED_AHEAD, 2)
     for first, chunk in zip(firsts, chunks, strict=False):
         images[first : first + len(chunk)] = torch.from_numpy(chunk[:, first_row:])
@@ -116,9 +116,10 @@ def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
 def cache_if_it_fits(
     loader: Loader, device: torch.device, free_bytes: int | None = None, first_row: int = 0
 ) -> Loader | GpuDataset:
-    """The loader's frames on `device`, from `first_row` on; the loader itself if they do not fit.
+    """The loader's frames, rows from `first_row` on, in the memory of `device` if they fit.
 
-    `free_bytes`: free memory of the device, None: as it reports. On a CPU nothing is cached.
+    Returns the loader itself if they do not fit, or on a CPU. `free_bytes`: free memory of the
+    device; None: the amount that the device reports.
     """
     if free_bytes is None:
         free_bytes = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0

@@ -1,10 +1,10 @@
-"""`labels.csv`: the labels of a user's own pictures, one row a picture.
+"""`labels.csv`: labels of a user's own pictures, one row per picture.
 
-Columns (named by a header, in any order): `file`, a path within the folder; `ml`, `mr`, `l`, `m`,
-`r`, in m, left negative, empty where there is no such marking; `angle`, rad, positive when the car
-points to the right of the track; `heading`: left, straight or right. `l`, `m`, `r` and `heading`
-may be `?`: unknown, without a loss and not counted. The columns of `OPTIONAL` may be left out, and
-their cells may be empty.
+Columns, named in a header, in any order: `file`, a path relative to the folder; `ml`, `mr`, `l`,
+`m`, `r`, distances in m, negative to the left, empty where there is no marking; `angle`, rad,
+positive when the car points to the right of the track; `heading`, the class of the road: left,
+straight or right. `l`, `m`, `r` and `heading` may be `?` (unknown): they then have no loss and are
+not evaluated. Columns and cells of `OPTIONAL` may be missing.
 """
 
 import csv
@@ -36,7 +36,7 @@ MARKING_LIMITS_M = {
     "m": (-2.0, 2.75),
     "r": (1.5, 7.0),
 }
-"""Range of the network's coding; labels beyond it would be clipped."""
+"""Range of the network's coding; labels outside it would be clipped."""
 ANGLE_LIMIT_RAD = 0.5
 ROAD_CLASSES = {kind.name.lower(): int(kind) for kind in tf.RoadClass}
 
@@ -45,8 +45,8 @@ Cells = dict[str, str]
 
 @dataclass(frozen=True)
 class CustomLabels:
-    """`distances` (N, 5) m, NaN where absent, `UNKNOWN_M` where unknown; `angle` (N,) rad;
-    `heading` (N,) classes, or `UNKNOWN_HEADING`."""
+    """Labels: `distances` (N, 5) m, NaN where absent, `UNKNOWN_M` where unknown; `angle` (N,) rad;
+    `heading` (N,) class, or `UNKNOWN_HEADING`."""
 
     distances: NDArray[np.float32]
     angle: NDArray[np.float32]
@@ -56,26 +56,28 @@ class CustomLabels:
         return len(self.angle)
 
     def take(self, rows: Any) -> "CustomLabels":
-        """Those of some of the pictures."""
+        """The labels of the pictures in `rows`."""
         return CustomLabels(self.distances[rows], self.angle[rows], self.heading[rows])
 
 
 @dataclass(frozen=True)
 class LabelledPicture:
-    """What a row gives beside the label."""
+    """The columns of a row other than the label."""
 
     line: int
     file: str
-    """A path within the folder."""
+    """Path of the picture, relative to the folder."""
     drive: str = ""
-    """Pictures of one drive are alike: they are weighed and held out together."""
+    """Name of the drive. Pictures of one drive are similar: they are weighted and held out
+    together."""
     light: str = ""
     camera: str = ""
-    """The file of the picture's own camera, a path within the folder; empty: the folder's."""
+    """Camera file of this picture, relative to the folder; empty: the folder's camera."""
     pitch_deg: float | None = None
-    """Of that camera in this picture, positive when it looks down; None: as the camera's file."""
+    """Pitch of the camera in this picture, degrees, positive downwards; None: as in the camera
+    file."""
     curvature: float = 0.0
-    """Of the road, 1/m, left positive: the markings are drawn with it."""
+    """Curvature of the road, 1/m, positive to the left; used to draw the markings."""
     std_m: float = 0.0
     """Standard deviation of the label's distances, m."""
     std_rad: float = 0.0
@@ -83,10 +85,9 @@ class LabelledPicture:
 
 
 def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
-    """The rows of a `labels.csv`, at least one, and their labels.
+    """The pictures and labels of a `labels.csv`, at least one.
 
-    File names may have bytes that are not UTF-8, as the file system's. Raises UserError that names
-    the faulty line.
+    File names may contain bytes that are not UTF-8. Raises UserError with the line of a faulty row.
     """
     pictures: list[LabelledPicture] = []
     rows: list[tuple[list[float], float, int]] = []
@@ -96,7 +97,7 @@ def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
         except ValueError as error:
             raise UserError(f"{path}, line {line}: {error}") from None
         pictures.append(picture)
-        rows.append(values)  # type: ignore[arg-type]  # as `_parse` gives them
+        rows.append(values)  # type: ignore[arg-type]  # the types of `_parse`
     if not pictures:
         raise UserError(f"{path} names no images")
     labels = CustomLabels(
@@ -108,7 +109,7 @@ def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
 
 
 def read_cells(path: Path) -> list[tuple[int, Cells]]:
-    """(line, cells by column) of each row, stripped; UserError as `read_labels`."""
+    """Line number and stripped cells by column, for each row. Raises UserError as `read_labels`."""
     found: list[tuple[int, Cells]] = []
     seen: dict[str, int] = {}
     with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
@@ -137,7 +138,8 @@ def read_cells(path: Path) -> list[tuple[int, Cells]]:
 
 
 def write_cells(path: Path, rows: list[Cells]) -> None:
-    """Replace a `labels.csv` by these rows, in one step and on the disk when it returns."""
+    """Replace a `labels.csv` by these rows, atomically; it is on the disk when the function
+    returns."""
     used = [name for name in OPTIONAL if any(row.get(name) for row in rows)]
     text = StringIO()
     writer = csv.DictWriter(text, (*COLUMNS, *used), restval="", lineterminator="\n")
@@ -147,7 +149,7 @@ def write_cells(path: Path, rows: list[Cells]) -> None:
 
 
 def check_cells(cells: Cells) -> None:
-    """Raise UserError that describes the fault of a row that is to be written."""
+    """Raise UserError with the reason if a row to be written is faulty."""
     try:
         _parse(0, {name: cells.get(name, "") for name in (*COLUMNS, *OPTIONAL)})
     except ValueError as error:
@@ -155,7 +157,7 @@ def check_cells(cells: Cells) -> None:
 
 
 def path_within(name: str) -> bool:
-    """Whether a name in a table is a path within the table's folder."""
+    """Whether a name in a table is a path inside the table's folder."""
     path = PurePosixPath(name)
     return bool(name) and name != UNKNOWN and not path.is_absolute() and ".." not in path.parts
 
@@ -173,9 +175,9 @@ def _check_head(path: Path, names: list[str]) -> None:
 
 
 def _parse(line: int, cells: Cells) -> tuple[LabelledPicture, list[float], float, int]:
-    """The picture, distances in m (NaN absent), angle in rad and class of a row.
+    """Picture, distances in m (NaN where absent), angle in rad and class of a row.
 
-    Raises ValueError that describes the fault.
+    Raises ValueError with the reason for a faulty row.
     """
     for column, text in cells.items():
         if text == UNKNOWN and column not in MAY_BE_UNKNOWN:
@@ -208,13 +210,13 @@ def _check_pairs(found: dict[str, float]) -> None:
         raise ValueError("ml and mr are the two sides of one lane: give both or none")
     beside = (found["l"], found["r"])
     if math.isnan(found["m"]) and not all(map(math.isnan, beside)):
-        raise ValueError("l and r stand beside m: without m they must be empty")
+        raise ValueError("l and r are the markings next to m: without m they must be empty")
     if found["m"] == UNKNOWN_M and not all(value == UNKNOWN_M for value in beside):
-        raise ValueError("l and r stand beside m: where m is `?`, they must be, too")
+        raise ValueError("l and r are the markings next to m: where m is `?`, they must be `?` too")
 
 
 def _picture(line: int, cells: Cells) -> LabelledPicture:
-    """The optional cells of a row; ValueError that describes a fault."""
+    """The picture with the optional cells of its row. Raises ValueError for a faulty cell."""
     camera = cells.get("camera", "")
     if camera and not path_within(camera):
         raise ValueError(f"the camera {camera!r} is no path within the folder")
@@ -263,10 +265,11 @@ def _number(name: str, text: str) -> float:
 
 
 def lane_cells(ml: float, mr: float) -> Cells:
-    """The cells of the five distances of a car of whose lane both markings (m) are known.
+    """Cells of the five distances, from the two markings (m) of the car's lane.
 
-    By the definitions: `ml` and `mr` are there from 0.5 m to both markings on; over 1.2 m from both
-    there is no `m`, else it is the nearer one, and what lies beyond that is unknown.
+    By the definitions of the features: `ml` and `mr` are present from 0.5 m to both markings on.
+    Over 1.2 m from both markings there is no `m`; otherwise `m` is the nearer marking, and the
+    markings beyond it are unknown.
     """
     near = min(-ml, mr)
     in_lane = near >= tf.IN_LANE_MARGIN_M

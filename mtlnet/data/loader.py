@@ -1,7 +1,7 @@
-"""Batches for training, decoded and augmented on threads while the network computes.
+"""Training batches, decoded and augmented on threads while the network computes.
 
-A batch is a pure function of (seed, step): a resumed run gets the same batches as one without
-interruption.
+A batch is a pure function of (seed, step), so a resumed run gets the same batches as an
+uninterrupted one.
 """
 
 import ctypes
@@ -29,31 +29,31 @@ from mtlnet.data.augment.pipeline import (
 from mtlnet.data.model_labels import model_labels
 from trackfeatures.camera import CameraParameters
 
-PREFETCH = 3  # batches made or waiting
-WORKERS = 2  # threads: while one waits for the last image of its batch, the other starts the next
+PREFETCH = 3  # batches made in advance
+WORKERS = 2  # threads: one starts the next batch while the other waits for its last image
 
 
 Made = TypeVar("Made")
 
 
 class LabelArrays(Protocol):
-    """Labels for training; `datagen.recording.Labels` has them."""
+    """Labels for training, as in `datagen.recording.Labels`."""
 
     @property
     def distances(self) -> NDArray[np.float32]:
-        """(N, 5) m, NaN where absent."""
+        """Distances (N, 5) in m, NaN where absent."""
 
     @property
     def angle(self) -> NDArray[np.float32]:
-        """(N,) rad."""
+        """Angles (N,) in rad."""
 
     @property
     def heading(self) -> NDArray[np.int64]:
-        """(N,) classes."""
+        """Classes (N,) of the road."""
 
 
 class Images(Protocol):
-    """Labelled images; `datagen.recording.Frames` is one."""
+    """Labelled images, as `datagen.recording.Frames`."""
 
     def __len__(self) -> int: ...
 
@@ -66,28 +66,28 @@ class Images(Protocol):
 
 
 class AheadLabels(Protocol):
-    """Labels of the road ahead; `mtlnet.data.road_ahead.RoadAhead` is one."""
+    """Labels of the road ahead, as `mtlnet.data.road_ahead.RoadAhead`."""
 
     def labels(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """(B, A) for frames augmented with `params`."""
+        """Labels (B, A) of frames augmented with `params`."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """`images` (B, H, W, 3) uint8, `coded` (B, 6), `heading` (B,), `ahead` (B, A)."""
+    """A batch: `images` uint8 (B, H, W, 3), `coded` (B, 6), `heading` (B,), `ahead` (B, A)."""
 
     images: NDArray[np.uint8]
     coded: NDArray[np.float32]
     heading: NDArray[np.int64]
     ahead: NDArray[np.float32]
-    """Labels of the road ahead: no columns, or those of `mtlnet.model.auxiliary`."""
+    """Labels of the road ahead: A is 0, or the number of labels of `mtlnet.model.auxiliary`."""
 
 
 @dataclass(frozen=True)
 class BatchLabels:
-    """A batch without its images: which frames, their augmentation, and the labels after it."""
+    """A batch without images: rows of the frames, augmentation parameters, augmented labels."""
 
     chosen: NDArray[np.int64]  # (B,)
     params: AugmentParams | None
@@ -97,11 +97,11 @@ class BatchLabels:
 
 
 class Loader:
-    """Endless batches from `frames`, shuffled anew in each epoch.
+    """Endless batches of `frames`, shuffled again in each epoch.
 
-    `part` (index, count): makes only that part of each batch of `batch` images, for one of several
-    processes; the images are those of the whole batch. `repeats` (N,): how often each frame occurs
-    in an epoch; without it once.
+    `part` (index, count): this process's part of each batch of `batch` images, if there are several
+    processes; all parts together are the batch of a single process. `repeats` (N,): how often each
+    frame occurs in an epoch; None: once.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Loader:
         self.rows = slice(index * batch // parts, (index + 1) * batch // parts)
         shape = (self.rows.stop - self.rows.start, camera.height, camera.width, 3)
         self._buffers = BufferPool(shape)
-        # Of varied roads the camera's height differs from round to round.
+        # On varied roads the height of the camera differs between rounds.
         labels = model_labels(frames) if isinstance(frames, Frames) else frames.labels
         self._labels = labels
         self.coded = tf.encode(labels.distances, labels.angle)
@@ -155,7 +155,7 @@ class Loader:
         return Batch(images, labels.coded, labels.heading, labels.ahead)
 
     def make_labels(self, step: int) -> BatchLabels:
-        """The same without its images."""
+        """This process's part of batch `step`, without its images."""
         chosen = self.indices(step)[self.rows]
         heading = self.heading[chosen]
         if not self.augment:
@@ -178,14 +178,15 @@ class Loader:
         return self._ahead.labels(chosen, params)
 
     def batches(self, first: int) -> Iterator[Batch]:
-        """Batches `first`, `first` + 1, ... without end, made in advance on threads."""
+        """Yields batches `first`, `first` + 1, ... without end, made in advance on threads."""
         return make_ahead(self.make, first, PREFETCH, WORKERS)
 
 
 def make_ahead(
     make: Callable[[int], Made], first: int, ahead: int, workers: int
 ) -> Generator[Made, None, None]:
-    """make(first), make(first + 1), ... without end, on threads, `ahead` made or waiting."""
+    """Yields make(first), make(first + 1), ... without end; threads keep `ahead` results in
+    advance."""
     with ThreadPoolExecutor(workers, thread_name_prefix="loader") as pool:
         waiting = deque(pool.submit(make, first + i) for i in range(ahead))
         try:
@@ -199,10 +200,10 @@ def make_ahead(
 
 
 class BufferPool:
-    """uint8 arrays of one shape whose memory is reused once no array or view refers to it.
+    """uint8 arrays of one shape, whose memory is reused once no array or view refers to it.
 
-    Fresh memory costs a page fault every 4 KiB. There are never more buffers than were in use at
-    the same time.
+    Fresh memory costs one page fault per 4 KiB. The pool never holds more buffers than were in use
+    at the same time.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -211,7 +212,7 @@ class BufferPool:
         self._free: list[NDArray[np.uint8]] = []
 
     def take(self) -> NDArray[np.uint8]:
-        """An array with arbitrary content."""
+        """A buffer as an array with arbitrary content."""
         try:
             memory = self._free.pop()
         except IndexError:

@@ -1,8 +1,9 @@
-"""Labels and answers of rounds whose camera is mounted elsewhere than the model's.
+"""Labels and outputs for rounds whose camera is mounted at another place than the model's.
 
-A picture does not show how high its camera is. The network answers as if every picture were of the
-model's camera: what it is trained on are the distances that such a car would have beside such a
-road. Its answers are turned back into metres of the car by `Rectification.outputs`.
+A picture does not show the height of its camera, so the network answers as if every picture were
+taken by the model's camera. It is therefore trained on the distances that a car with the model's
+camera would have on a road that looks the same. `Rectification.outputs` converts the answers back
+to metres of the actual car.
 """
 
 from dataclasses import replace
@@ -20,10 +21,10 @@ from trackfeatures.measurement import LineOffsets
 
 
 def model_labels(frames: Frames) -> Labels:
-    """The labels of `frames` as the network is to answer them, in metres beside `frames.camera`.
+    """Labels of `frames` in metres at the model's camera, `frames.camera`: the network's targets.
 
-    The limits of the in-lane and the on-marking system are met there, not at the car: whether a
-    distance is present follows from the picture as well.
+    The limits of the in-lane and the on-marking system are applied there and not at the actual car,
+    so that the presence of a distance also follows from the picture alone.
     """
     labels = frames.labels
     distances = labels.distances.copy()
@@ -35,7 +36,7 @@ def model_labels(frames: Frames) -> Labels:
 
 
 def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.float32]:
-    """A model's outputs (N, 9 to 22) for `frames` in metres of the cars that the rounds show."""
+    """A model's outputs (N, 9 to 22) for `frames`, converted to metres of the recorded cars."""
     changed, of_round = outputs.copy(), frames.labels.round
     for number, info in moved_rounds(frames):
         rows = np.flatnonzero(of_round == number)
@@ -44,18 +45,18 @@ def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.floa
 
 
 def moved_rounds(frames: Frames) -> list[tuple[int, RoundInfo]]:
-    """Number and description of the rounds whose camera is mounted elsewhere."""
+    """Number and description of each round whose camera is mounted at another place."""
     rounds = enumerate(frames.rounds)
     return [(n, info) for n, info in rounds if not _as_mounted(info.label_camera, frames.camera)]
 
 
 def round_rectification(info: RoundInfo, camera: CameraParameters) -> Rectification:
-    """Between the camera that a round's labels were measured with and `camera`, the model's."""
+    """Rectification from the camera with which a round was labelled to `camera`, the model's."""
     return Rectification(info.label_camera, camera, any_height=True)
 
 
 def camera_scales(frames: Frames) -> NDArray[np.float64]:
-    """Metres beside the model's camera per metre of the car, of each of `frames` (N,)."""
+    """Metres at the model's camera per metre of the recorded car, for each of `frames` (N,)."""
     rounds = (round_rectification(info, frames.camera) for info in frames.rounds)
     return np.array([1 / each.scale for each in rounds])[frames.labels.round]
 
@@ -65,7 +66,7 @@ def _as_mounted(camera: CameraParameters, other: CameraParameters) -> bool:
 
 
 def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArray[np.float32]:
-    """Distances (N, 5) of a round's frames beside `camera`, NaN where absent there."""
+    """Distances (N, 5) of a round's frames at `camera`, NaN where absent there."""
     rectification = round_rectification(info, camera)
     scale = 1 / rectification.scale
     # Distances are measured at the centre of gravity, not at the camera.
@@ -77,8 +78,8 @@ def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArra
 
 
 def _foot(labels: Labels, info: RoundInfo) -> NDArray[np.float64]:
-    """How far left of the recorded offset (N,) distances were measured: on a banked road, at the
-    foot of the centre of gravity."""
+    """Offsets (N,), m, from the recorded position to the point at which distances were measured, to
+    the left: on a banked road, the foot of the centre of gravity."""
     level = labels.to_middle.astype(np.float64)
     expected = _measured(level, info.lanes, info.lane_width_m, info.line_offsets)
     gaps = labels.distances - expected
@@ -91,7 +92,7 @@ def _foot(labels: Labels, info: RoundInfo) -> NDArray[np.float64]:
 def _measured(
     to_middle: NDArray[np.float64], lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> NDArray[np.float32]:
-    """The distances (N, 5) at offsets (N,) from the middle of a road, NaN where absent."""
+    """Distances (N, 5) at offsets (N,) from the middle of a road, NaN where absent."""
     found = (tf.measure(y, 0.0, 0.0, 0.0, lanes, lane_width_m, offsets) for y in to_middle.tolist())
     rows = [[np.nan if d is None else d for d in each.distances.values()] for each in found]
     return np.array(rows, np.float32).reshape(-1, len(tf.MARKINGS))

@@ -1,8 +1,8 @@
-"""Copies of a labelled picture for its evaluation: mirrored, and turned about the vertical.
+"""Copies of a labelled picture for evaluation: mirrored, or rotated about the vertical axis.
 
-A few drives show few headings and offsets, and the answer that never changes scores well on them.
-Copies widen both. A mirrored picture is exact. A camera that turns about its own eye sees an exact
-homography of the picture; what it did not show is grey.
+A few drives contain few angles and offsets, so a constant answer scores well on them. Copies widen
+the range of both. Mirroring is exact. A rotation about the camera's optical centre is an exact
+homography of the picture; areas that the picture does not show are grey.
 """
 
 from dataclasses import replace
@@ -20,14 +20,15 @@ from trackfeatures.errors import UserError
 
 PLAIN, MIRRORED = "plain", "mirrored"
 TURNS_RAD = {"turned left": -0.06, "turned right": 0.06}
-"""What a turned copy adds to the angle, rad."""
+"""Added to the label's angle by each kind of rotated copy, rad."""
 COPIES = (PLAIN, MIRRORED, *TURNS_RAD)
 KINDS = {"mirrored": (MIRRORED,), "turned": tuple(TURNS_RAD)}
-"""The copies that each word of `--copies` asks for."""
+"""Kinds of copies by the word in `--copies`."""
 
 
 def parse_copies(text: str) -> tuple[str, ...]:
-    """The pictures themselves, and the copies of `--copies mirrored,turned`. Raises UserError."""
+    """Kinds of copies for `--copies mirrored,turned`, the picture itself first. Raises
+    UserError."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     unknown = [word for word in words if word not in KINDS]
     if unknown:
@@ -36,14 +37,14 @@ def parse_copies(text: str) -> tuple[str, ...]:
 
 
 def copied_camera(camera: CameraParameters, copy: str) -> CameraParameters:
-    """The camera that would have taken the copy of a picture."""
+    """The camera that would have taken the copy."""
     if copy != MIRRORED:
         return camera
     matrix, coefficients = camera.matrix, list(camera.coefficients)
     if matrix is not None:
         matrix = (matrix[0], matrix[1], camera.width - 1 - matrix[2], matrix[3])
     if camera.distortion == "opencv":
-        coefficients[3] = -coefficients[3]  # p2, the tangential part across
+        coefficients[3] = -coefficients[3]  # p2, the horizontal tangential coefficient
     return replace(
         camera,
         y=-camera.y,
@@ -57,7 +58,8 @@ def copied_camera(camera: CameraParameters, copy: str) -> CameraParameters:
 def copied_picture(
     image: NDArray[np.uint8], camera: CameraParameters, copy: str
 ) -> NDArray[np.uint8]:
-    """The copy of a picture (H, W, 3) that `camera` took, at any size of its aspect ratio."""
+    """The copy of a picture (H, W, 3) taken by `camera`, at any size of the camera's aspect
+    ratio."""
     if copy == PLAIN:
         return image
     if copy == MIRRORED:
@@ -66,9 +68,10 @@ def copied_picture(
 
 
 def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) -> NDArray[np.uint8]:
-    """The picture of a camera that is turned to its right about its own vertical, rad."""
+    """The picture after rotating the camera to its right by `right` (rad) about its vertical
+    axis."""
     cosine, sine = np.cos(right), np.sin(right)
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # to the old directions
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # new to old directions
     size = (camera.width, camera.height)
     grey = (BORDER_LEVEL,) * 3
     if camera.distortion == "none":
@@ -89,7 +92,7 @@ def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) ->
 def copied_label(
     labels: CustomLabels, row: int, camera: CameraParameters, copy: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Distances (1, 5), angle (1,) and class (1,) of the copy of the picture `row`."""
+    """Distances (1, 5), angle (1,) and class (1,) of the copy of picture `row`."""
     one = labels.take([row])
     distances, angle, heading = one.distances, one.angle, one.heading
     if copy == MIRRORED:
@@ -97,7 +100,7 @@ def copied_label(
         distances = np.where(np.isinf(swapped), np.float32(UNKNOWN_M), swapped)
         return distances, -angle, tf.mirror_heading(heading)
     if copy in TURNS_RAD:
-        # The camera stays where it is; the centre of gravity moves about it.
+        # The camera keeps its place; the centre of gravity moves around it.
         turned = angle + np.float32(TURNS_RAD[copy])
         ahead = np.sin(turned) - np.sin(angle)
         aside = np.cos(turned) - np.cos(angle)

@@ -1,11 +1,11 @@
-"""What of the road ahead a network may learn beside its answers, from recorded rounds.
+"""Labels of the road ahead from recorded rounds, for the auxiliary heads in training.
 
 Columns: where the two markings of the car's lane cross the image rows `ROWS`, from the polylines
-recorded with every image; rows and columns count from its upper left corner, px. Curvature: that
-of the road `AHEAD_M` in front of the car, in 1/m, left positive, from the labels of all frames of
-the same track. NaN where it is not known: out of the image, or where no frame was recorded.
+recorded with every image; px from the upper left corner of the image. Curvature: of the road at
+`AHEAD_M` in front of the car, 1/m, positive to the left, from the labels of all frames of the same
+track. NaN where unknown: outside the image, or where no frame was recorded nearby.
 
-For training only (`mtlnet.model.auxiliary`); answering needs none of it.
+Used only in training (`mtlnet.model.auxiliary`).
 """
 
 from collections.abc import Sequence
@@ -35,24 +35,25 @@ from mtlnet.model.auxiliary import AHEAD_M, ROWS, SIDES
 from trackfeatures.camera import CameraParameters
 
 POINTS = 34
-"""Of a polyline, one a metre from just behind the eye on: the furthest row sees 25 m ahead."""
+"""Number of points of a polyline, one per metre, starting just behind the camera: the farthest of
+`ROWS` is 25 m ahead."""
 NEAREST_M, APART_M = 12.0, 1.2
-"""A polyline that begins further away, or further to the side, is no marking of this lane."""
-CHUNK = 20_000  # frames read by a process at once
+"""Limits, m ahead and to the side, for the start of a polyline of this lane's markings."""
+CHUNK = 20_000  # frames per task of a reading process
 KNOWN_M = 2.0
-"""A curvature is known where a frame was recorded so near."""
+"""A curvature is known if a frame was recorded within this distance of the place."""
 
 HARD_CURVATURE = 1 / 80
 HARD_NEAR_CHANGE_M = 8.0
-"""Of a model's wrong classes, 80 % were so near a change of class, where 53 % were within 4 m."""
-
-Numbers = NDArray[np.float32]
+"""Distance to a change of class within which a frame is hard: 80 % of a model's wrong classes lay
+within 8 m, 53 % within 4 m."""
 
 
 class RoadAhead:
-    """Labels of the road ahead for frames in order: columns and curvatures, of changed images.
+    """Labels of the road ahead for frames, after augmentation of their images.
 
-    `keep`: read the polylines of all frames now, on all cores, and keep them, 0.5 kB a frame.
+    `keep`: read the polylines of all frames now, on all cores, and keep them in memory (0.5 kB per
+    frame).
     """
 
     def __init__(self, frames: Frames, camera: CameraParameters, *, keep: bool = False) -> None:
@@ -67,20 +68,24 @@ class RoadAhead:
         scale = camera_scales(frames)
         self._curvature = curvature_ahead(labels.s, labels.curvature, tracks, scale)
 
-    def labels(self, indices: NDArray[np.int64], params: AugmentParams | None = None) -> Numbers:
-        """Columns and curvatures of frames as one row each (B, `mtlnet.model.auxiliary.LABELS`)."""
+    def labels(
+        self, indices: NDArray[np.int64], params: AugmentParams | None = None
+    ) -> NDArray[np.float32]:
+        """Columns and curvatures as one row per frame (B, `mtlnet.model.auxiliary.LABELS`)."""
         columns = self.columns(indices, params).reshape(len(indices), -1)
         return np.concatenate([columns, self.curvatures(indices, params)], 1)
 
-    def columns(self, indices: NDArray[np.int64], params: AugmentParams | None = None) -> Numbers:
-        """Columns (B, 2, ROWS) in px of frames, after `params` to their images."""
+    def columns(
+        self, indices: NDArray[np.int64], params: AugmentParams | None = None
+    ) -> NDArray[np.float32]:
+        """Columns (B, 2, ROWS) in px of frames whose images were augmented with `params`."""
         points = self._read(indices) if self._kept is None else self._kept[indices]
         if params is None:
             return crossings(points, self._camera.width)
         return crossings(changed_points(points, params, self._camera), self._camera.width)
 
     def _read(self, indices: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The polylines (B, 2, POINTS, 2) in px of both markings, NaN where there is none."""
+        """Polylines (B, 2, POINTS, 2) in px of both markings, NaN where there is none."""
         points = np.full((len(indices), SIDES, POINTS, 2), np.nan, np.float32)
         for row, i in enumerate(indices.tolist()):
             number, frame = self._places[i].tolist()
@@ -103,14 +108,14 @@ class RoadAhead:
 
     def curvatures(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
-    ) -> Numbers:
-        """Curvatures (B, AHEAD_M) in 1/m of frames, after `params` to their images."""
+    ) -> NDArray[np.float32]:
+        """Curvatures (B, AHEAD_M) in 1/m of frames whose images were augmented with `params`."""
         found = self._curvature[indices]
         return found if params is None else np.where(params.mirrored[:, None], -found, found)
 
 
 def _annotations(path: Path) -> Messages:
-    """The annotations of a round's frames; DatasetError unless each image has its own."""
+    """Annotations of a round's frames. Raises DatasetError unless each image has its annotation."""
     found = open_round(path, (CAMERA, ANNOTATIONS)).messages
     if not np.array_equal(found[CAMERA].log_time, found[ANNOTATIONS].log_time):
         raise DatasetError(
@@ -121,8 +126,8 @@ def _annotations(path: Path) -> Messages:
 
 
 def lane_beside(frames: Frames) -> NDArray[np.float64]:
-    """Distances (N, 2) in m beside the model's camera, left negative, to both markings of the lane
-    that each car is in or nearest to, whether or not they are active."""
+    """Distances (N, 2) in m at the model's camera, negative to the left, to both markings of the
+    lane that the car is in or nearest to, whether or not the features are present."""
     labels, rounds = frames.labels, frames.rounds
     width = np.array([info.lane_width_m for info in rounds])[labels.round]
     centre = width * (labels.lanes / 2 - labels.lane_index - 0.5)
@@ -136,10 +141,10 @@ def own_markings(
     camera: CameraParameters,
     out: NDArray[np.floating[Any]],
 ) -> None:
-    """Put the polylines of the lane's markings, `beside` (2,) m, into `out` (2, POINTS, 2).
+    """Write the polylines of the lane's markings at `beside` (2,) m to `out` (2, POINTS, 2).
 
-    Which is which is told at a polyline's near end, as if the road were level there: lanes are
-    2.7 m wide at least.
+    A polyline is assigned to a marking by its near end, as if the road were level there; lanes are
+    at least 2.7 m wide.
     """
     nearest = np.full(SIDES, APART_M)
     drawn = [line for line in lines if len(line)]
@@ -158,7 +163,7 @@ def own_markings(
 def changed_points(
     points: NDArray[np.floating[Any]], params: AugmentParams, camera: CameraParameters
 ) -> NDArray[np.float64]:
-    """Where points (B, 2, POINTS, 2) of images lie after `params` to these."""
+    """Points (B, 2, POINTS, 2) of images after augmentation with `params`."""
     moved = points.astype(np.float64)
     below = np.maximum(moved[..., 1] - horizon_row(camera), 0.0)
     moved[..., 0] += params.shift[:, None, None] * shear_per_metre(camera) * below
@@ -176,20 +181,20 @@ def changed_points(
 
 @lru_cache(maxsize=2)
 def _turned(camera: CameraParameters) -> NDArray[np.float64]:
-    """The homographies (ROTATIONS, 3, 3) of the rotations there are."""
+    """Homographies (ROTATIONS, 3, 3) of all rotations of the augmentation."""
     return np.stack([rotation_homography(camera, *turn) for turn in rotations().tolist()])
 
 
-def crossings(points: NDArray[np.floating[Any]], width: int) -> Numbers:
-    """The columns (B, 2, ROWS) at which polylines (B, 2, POINTS, 2) first cross `ROWS`, in px from
-    the image's corner.
+def crossings(points: NDArray[np.floating[Any]], width: int) -> NDArray[np.float32]:
+    """Columns (B, 2, ROWS), px, where polylines (B, 2, POINTS, 2) first cross the image rows
+    `ROWS`.
 
-    NaN where one does not, or out of an image so many px wide.
+    NaN where a polyline does not cross the row, or crosses it outside an image of `width` px.
     """
     u, v = points[..., 0] + CORNER_PX, points[..., 1] + CORNER_PX
     rows = np.array(ROWS)
     v0, v1 = v[..., :-1, None], v[..., 1:, None]
-    # From the near end on a line goes up in the image; comparisons with NaN are false.
+    # From its near end on, a line rises in the image; comparisons with NaN are false.
     across = (v0 >= rows) & (v1 < rows)
     first = across.argmax(2)  # (B, 2, ROWS)
     found = across.any(2)
@@ -202,14 +207,16 @@ def crossings(points: NDArray[np.floating[Any]], width: int) -> Numbers:
 
 
 def curvature_ahead(
-    s: Numbers, curvature: Numbers, tracks: NDArray[np.str_], scale: NDArray[np.float64]
-) -> Numbers:
-    """Curvatures (N, AHEAD_M) in 1/m in front of cars at `s` (N,) m, where it is `curvature` (N,).
+    s: NDArray[np.float32],
+    curvature: NDArray[np.float32],
+    tracks: NDArray[np.str_],
+    scale: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Curvatures (N, AHEAD_M) in 1/m in front of cars at `s` (N,) m with `curvature` (N,) there.
 
-    `scale` (N,): metres beside the model's camera, in which the answer is, per metre of the car.
-
-    A track is the same in all its rounds, so that the frames of all of them tell of it; NaN where
-    none was near.
+    `scale` (N,): metres at the model's camera, in which the result is given, per metre of the car.
+    A track is the same in all its rounds, so the frames of all rounds are used; NaN where no frame
+    was recorded nearby.
     """
     found = np.full((len(s), len(AHEAD_M)), np.nan, np.float32)
     for track in np.unique(tracks).tolist():
@@ -227,12 +234,15 @@ def curvature_ahead(
 
 
 def hard_frames(
-    s: Numbers, curvature: Numbers, heading: NDArray[np.int64], tracks: NDArray[np.str_]
+    s: NDArray[np.float32],
+    curvature: NDArray[np.float32],
+    heading: NDArray[np.int64],
+    tracks: NDArray[np.str_],
 ) -> NDArray[np.bool_]:
-    """Frames (N,) in sharp bends, or near a place where the road's class changes.
+    """Frames (N,) in sharp bends, or near a place where the class of the road changes.
 
-    `s` m, `curvature` 1/m and `heading` (N,) are the labels; the frames of a track tell together
-    where its class changes. Most of a network's errors are there.
+    Most errors of a network occur there. `s` m, `curvature` 1/m and `heading` (N,) are the labels;
+    all frames of a track together give the places where its class changes.
     """
     found = np.abs(curvature) > HARD_CURVATURE
     for track in np.unique(tracks).tolist():
@@ -250,7 +260,7 @@ def hard_frames(
 
 
 def hard_frame_repeats(frames: Images, repeats: int) -> NDArray[np.int64] | None:
-    """How often each of recorded frames is drawn in an epoch; None: each once."""
+    """How often each frame of recorded rounds is drawn in an epoch; None: each once."""
     if repeats == 1 or not isinstance(frames, Frames):
         return None
     labels = frames.labels

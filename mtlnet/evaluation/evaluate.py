@@ -1,5 +1,5 @@
-"""Evaluates a model on the rounds of a dataset, or on a user's own labelled images:
-`mtlnet evaluate --model RUN --data DIR --json`."""
+"""Evaluates a model on rounds of a dataset, or on a user's own labelled pictures: `mtlnet evaluate
+--model RUN --data DIR --json`."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ from mtlnet.data.labels_file import LABELS
 from mtlnet.data.loader import Images
 from mtlnet.data.model_labels import car_outputs
 from mtlnet.data.picture_copies import PLAIN, parse_copies
-from mtlnet.data.sources import require_camera, require_decodable
+from mtlnet.data.rounds import require_camera, require_decodable
 from mtlnet.evaluation.html_report import page_file, write_page, write_worst_sheet
 from mtlnet.evaluation.metrics import evaluate_by_groups
 from mtlnet.evaluation.picture_page import write_picture_page
@@ -26,7 +26,7 @@ from mtlnet.inference.model_card import ModelCard, ModelError
 from runtime.files import check_folder
 from trackfeatures.errors import UserError
 
-CHUNK = 32  # frames that a thread reads at a time
+CHUNK = 32  # frames per task of a thread
 
 
 def evaluate(
@@ -39,17 +39,18 @@ def evaluate(
     worst: Path | None = None,
     copies: str = "",
 ) -> dict[str, Any]:
-    """The report of `mtlnet.evaluation.metrics` on one split of a dataset, as a whole and by group.
+    """The report of `mtlnet.evaluation.metrics` on one split of a dataset, for all frames and by
+    group.
 
-    `engines`: the same model, once for each thread. `report(done, all)` is called after each chunk
-    of frames. `page`: an HTML file to write too, or its folder; `worst`: a JPEG of the frames with
-    the largest errors. `every`: evaluate every n-th frame only; frames next to each other are much
-    alike. `copies`: of a user's own pictures, as `--copies`. Raises UserError when data and model
-    do not fit.
+    `engines`: the same model once per thread. `report(done, total)` is called after each chunk of
+    frames. `page`: an HTML file to write, or its folder; `worst`: a JPEG to write of the frames
+    with the largest errors. `every`: evaluate every n-th frame only, because consecutive frames are
+    similar. `copies`: value of `--copies` for a user's own pictures. Raises UserError when data and
+    model do not fit.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
-    # Before the long computation: whether the files can be written.
+    # Before the long computation: check that the files can be written.
     if page is not None:
         page = page_file(page)
     if worst is not None:
@@ -70,7 +71,7 @@ def evaluate(
     try:
         outputs = predict_frames(engines, frames, report)
     except UndecodableImage:
-        require_decodable(frames, data)  # to name and count all of them
+        require_decodable(frames, data)  # names and counts all of them
         raise
     outputs = car_outputs(outputs, frames)
     mean = engine.card.data["mean"]
@@ -99,8 +100,8 @@ def evaluate_custom_images(
 ) -> dict[str, Any]:
     """The report on a user's own pictures with a `labels.csv` (`mtlnet.evaluation.pictures`).
 
-    `copies`: of `mtlnet.data.picture_copies`. `page`: an HTML file to write too. Pictures that show
-    too little of the model's view are counted. Raises UserError for faulty files.
+    `copies`: kinds of `mtlnet.data.picture_copies`. `page`: an HTML file to write. Pictures that
+    show too little of the model's view are counted. Raises UserError for faulty files.
     """
     engine = engines[0]
     images = open_custom_images(folder, engine.card.camera, copies, skip_refused=True)
@@ -121,7 +122,7 @@ def evaluate_custom_images(
 
 
 def about(engine: Engine) -> dict[str, Any]:
-    """What a report says of the model."""
+    """The entries of a report about the model."""
     return {
         "model": engine.card.name,
         "model_hash": engine.card.model_hash,
@@ -135,9 +136,9 @@ def predict_frames(
     frames: Images,
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """Outputs (N, 9 to 22) for all frames, a thread an engine.
+    """Outputs (N, 9 to 22) for all frames, one thread per engine.
 
-    One frame at a time, as in the service; on a GPU `CHUNK` at once.
+    One frame at a time, as in the service; on a GPU `CHUNK` frames at once.
     """
     idle: SimpleQueue[tuple[Engine, NDArray[np.uint8]]] = SimpleQueue()
     for engine in engines:
@@ -150,7 +151,7 @@ def predict_frames(
         try:
             found = frames.read_batch(rows, images[: len(rows)])
             if getattr(engine, "on_gpu", False):
-                return list(engine.batch(found))  # type: ignore[attr-defined]  # the torch engine's
+                return list(engine.batch(found))  # type: ignore[attr-defined]  # the torch engine
             return [engine(image) for image in found]
         finally:
             idle.put((engine, images))

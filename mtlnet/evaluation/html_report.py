@@ -1,4 +1,4 @@
-"""The evaluation as one HTML page that needs no other file: `mtlnet evaluate --report FILE`."""
+"""The evaluation as one self-contained HTML page: `mtlnet evaluate --report FILE`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.data.model_labels import round_rectification
-from mtlnet.evaluation.metrics import GROUPS, Numbers, signed_errors
+from mtlnet.evaluation.metrics import GROUPS, signed_errors
 from mtlnet.evaluation.tables import error_cells, mean_error_cells
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction, decode_outputs, split_outputs
@@ -25,9 +25,9 @@ from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_di
 
 FILE_NAME = "report.html"
 MAX_ROUNDS = 8
-"""Rounds drawn along the track."""
+"""Maximum number of rounds drawn along the track."""
 HEAVY_SHADOW = 0.3
-"""Share of the road in shadow from which an interval of a plot is shaded."""
+"""Share of the road in shadow above which an interval of a plot is shaded."""
 UNITS = {name: "rad" if name == "angle" else "m" for name in FEATURES}
 TITLES = {name: f"{name} ({unit})" for name, unit in UNITS.items()}
 
@@ -35,7 +35,7 @@ Rows = list[list[str]]
 
 
 def page_file(path: Path) -> Path:
-    """The file of the page for `path`, a file or a folder; makes its folder."""
+    """The file of the page for `path`, a file or a folder; makes the folder."""
     if path.is_dir():
         path = path / FILE_NAME
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,14 +43,14 @@ def page_file(path: Path) -> Path:
 
 
 def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
-    """Write the page of `mtlnet.evaluation.evaluate`'s report to `path`, a file or a folder."""
+    """Write the page for a report of `mtlnet.evaluation.evaluate` to `path`, a file or a folder."""
     path = page_file(path)
     atomic_write(path, page(report, frames, outputs), fsync=True)
     return path
 
 
 def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
-    """HTML of `report` on `outputs` (N, 9 to 22) for `frames`."""
+    """HTML page of `report` on `outputs` (N, 9 to 22) for `frames`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     return render(
         "mtlnet.evaluation",
@@ -98,7 +98,7 @@ def _reliability(uncertainty: dict[str, Any]) -> Iterator[Markup]:
 
 
 def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A table for each grouping: its title, mean errors by feature and accuracy of the class."""
+    """A table for each grouping: title, mean errors by feature, accuracy of the class."""
     for grouping, label in GROUPS.items():
         head = [label, "frames", *TITLES.values(), "class"]
         if "uncertainty" in report:
@@ -117,7 +117,7 @@ def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[dict[str, Any]]:
-    """The first round of each track: true and predicted offset and angle."""
+    """For the first round of each track: true and predicted offset and angle."""
     shown: set[str] = set()
     for number, info in enumerate(frames.rounds):
         rows = np.flatnonzero(frames.labels.round == number)
@@ -155,15 +155,16 @@ def _drive_charts(
         yield line_plot(Plot(f"{title} ({unit})", lines, "m driven", shaded))
 
 
-def _distance_driven(s: Numbers) -> Numbers:
-    """Metres since the first frame (N,) of track positions s; crossing the start line adds 0."""
+def _distance_driven(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance from the first frame (N,), m, from track positions s; crossing the start line adds
+    0."""
     steps = np.diff(s)
     steps[steps < 0] = 0.0
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _intervals(x: Numbers, chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Where `chosen` (N,) is true without a gap: the x of its beginning and end."""
+def _intervals(x: NDArray[np.float64], chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """x of the begin and end of each interval in which `chosen` (N,) is true without a gap."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
     last = len(x) - 1
     return [
@@ -176,20 +177,20 @@ def _intervals(x: Numbers, chosen: NDArray[np.bool_]) -> list[tuple[float, float
 
 WORST_PER_FEATURE = 2
 MIN_FRAMES_APART = 40
-"""Frames between two worst frames of a round, so that one place is shown once."""
+"""Least number of frames between two worst frames of a round, so that a place is shown once."""
 
 
 @dataclass(frozen=True)
 class WorstFrame:
-    """Frame `row`, on which `feature` has the signed `error` (m or rad)."""
+    """Frame `row`, in which `feature` has the signed `error` (m or rad)."""
 
     row: int
     feature: str
     error: float
 
 
-def worst_frames(errors: Numbers, rounds: NDArray[np.int64]) -> list[WorstFrame]:
-    """The `WORST_PER_FEATURE` worst frames of each feature; errors (N, 7), rounds (N,)."""
+def worst_frames(errors: NDArray[np.float64], rounds: NDArray[np.int64]) -> list[WorstFrame]:
+    """The `WORST_PER_FEATURE` worst frames of each feature, from errors (N, 7) and rounds (N,)."""
     chosen: list[WorstFrame] = []
     for i in (5, 6, 0, 1, 3, 2, 4):
         sizes = np.abs(errors[:, i])
@@ -209,9 +210,9 @@ def worst_frames(errors: Numbers, rounds: NDArray[np.int64]) -> list[WorstFrame]
 def worst_figures(
     frames: Frames, outputs: NDArray[np.float32], chosen: list[WorstFrame]
 ) -> Iterator[dict[str, Any]]:
-    """Of each chosen frame: its image (truth green, prediction orange) and its caption.
+    """For each chosen frame: its image (truth green, prediction orange) and its caption.
 
-    Each has `image`, RGB of twice the frame's size, and texts: `feature`, `error`, `note`, `place`.
+    Keys: `image`, RGB at twice the frame's size; texts `feature`, `error`, `note`, `place`.
     """
     labels = frames.labels
     for worst in chosen:
@@ -237,7 +238,7 @@ def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[
     note = ""
     if prediction.std is not None:
         std = prediction.std[worst.feature]
-        if std is None:  # the error is that of the value behind it
+        if std is None:  # absent: the error is that of the undecoded value
             note = ", predicted absent"
         else:
             note = f", predicted standard deviation {std:.2g} {unit}"
@@ -257,7 +258,7 @@ CAPTION_PX = 48
 
 
 def write_worst_sheet(path: Path, frames: Frames, outputs: NDArray[np.float32]) -> Path:
-    """Write the frames with the largest errors of each feature as one JPEG, with captions."""
+    """Write the frames with the largest errors of each feature as one JPEG with captions."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     figures = list(worst_figures(frames, outputs, worst_frames(errors, frames.labels.round)))
     height, width = frames.camera.height, frames.camera.width

@@ -1,9 +1,8 @@
 """Metrics of a model's outputs on labelled frames: errors in m and rad, by feature.
 
 A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, `to_lane_centre` and
-`angle`. Errors are predicted minus true, and NaN (not counted) where the label is inactive or
-unknown.
-The baseline is a constant prediction, the mean of the training labels.
+`angle`. Errors are predicted minus true; they are NaN, and not counted, where the label is inactive
+or unknown. The baseline is a constant prediction, the mean of the training labels.
 """
 
 from collections.abc import Iterator
@@ -14,40 +13,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from datagen.recording import Dataset, Frames
+from datagen.recording import Frames
+from mtlnet.data.description import nan_where_unknown
 from mtlnet.data.loader import LabelArrays
 from mtlnet.inference.prediction import OUTPUTS, split_outputs
 from mtlnet.inference.uncertainty import FEATURES
 from trackfeatures.definitions import UNKNOWN_HEADING
 
-Numbers = NDArray[np.float64]
 PERCENTILES = {"median": 50, "p95": 95, "p99": 99}
 CALIBRATION_BINS = 10
 
 
-def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> Numbers:
+def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> NDArray[np.float64]:
     """Errors (N, 7) of outputs (N, 9 or more).
 
-    That of a marking is taken on the predicted value, even where it decodes to "inactive"; that of
-    `to_lane_centre` where both the label and the prediction have one.
+    The error of a marking is that of the predicted value, even if it decodes to "inactive".
+    `to_lane_centre` has an error where both label and prediction have a value.
     """
     values = tf.decode_values(outputs[:, :6])
     offset = tf.localise(tf.decode(outputs[:, :6])[0]) - tf.localise(distances)
     columns = [values[:, :5] - distances, offset[:, None], (values[:, 5] - angle)[:, None]]
-    return _known(np.concatenate(columns, axis=1))
+    return nan_where_unknown(np.concatenate(columns, axis=1))
 
 
-def _known(errors: Numbers) -> Numbers:
-    """The errors, NaN where the label is unknown: infinite in metres."""
-    return np.where(np.isinf(errors), np.nan, errors)
-
-
-def error_percentiles(errors: Numbers) -> dict[str, dict[str, float | None]]:
-    """By feature: mean, median, 95th and 99th percentile of the absolute error; frames."""
+def error_percentiles(errors: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:
+    """By feature: mean, median, 95th and 99th percentile of the absolute error, and number of
+    frames."""
     return {name: _percentiles(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
 
 
-def _percentiles(sizes: Numbers) -> dict[str, float | None]:
+def _percentiles(sizes: NDArray[np.float64]) -> dict[str, float | None]:
     present = sizes[~np.isnan(sizes)]
     if not len(present):
         return {"mean": None, **dict.fromkeys(PERCENTILES), "frames": 0}
@@ -59,7 +54,7 @@ def _percentiles(sizes: Numbers) -> dict[str, float | None]:
 def confusion(
     heading: NDArray[np.int64], predicted: NDArray[np.int64]
 ) -> dict[str, dict[str, int]]:
-    """Number of frames by true class, then by predicted class."""
+    """Number of frames by true class and predicted class."""
     known = heading != UNKNOWN_HEADING
     heading, predicted = heading[known], predicted[known]
     names = [kind.name.lower() for kind in tf.RoadClass]
@@ -74,23 +69,25 @@ def confusion(
 def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | None]]:
     """By feature: shares of errors (N, 7) within one and two standard deviations (N, 7).
 
-    Those of a normal distribution are 0.683 and 0.954.
+    A normal distribution has 0.683 and 0.954.
     """
     ratio = np.abs(errors) / std
     within = [np.where(np.isnan(ratio), np.nan, ratio <= limit) for limit in (1, 2)]
     return {name: [_mean(each[:, i]) for each in within] for i, name in enumerate(FEATURES)}
 
 
-def calibration(std: NDArray[Any], errors: Numbers) -> dict[str, list[dict[str, float]]]:
+def calibration(
+    std: NDArray[Any], errors: NDArray[np.float64]
+) -> dict[str, list[dict[str, float]]]:
     """By feature: predicted standard deviations and observed errors, in bins of equal count.
 
-    Each bin: root mean square of the predicted deviations ("said"), that of the errors ("found"),
-    and the number of frames.
+    Each bin has the root mean square of the predicted standard deviations ("said"), that of the
+    errors ("found"), and the number of frames.
     """
     return {name: _bins(std[:, i], errors[:, i]) for i, name in enumerate(FEATURES)}
 
 
-def _bins(std: NDArray[Any], errors: Numbers) -> list[dict[str, float]]:
+def _bins(std: NDArray[Any], errors: NDArray[np.float64]) -> list[dict[str, float]]:
     present = np.flatnonzero(~np.isnan(errors))
     order = present[np.argsort(std[present], kind="stable")]
     parts = np.array_split(order, min(CALIBRATION_BINS, max(len(order), 1)))
@@ -105,51 +102,6 @@ def _rms(values: NDArray[Any]) -> float:
     return float(np.sqrt((values.astype(np.float64) ** 2).mean()))
 
 
-# The description of the training data in a model's card, with the mean of its labels.
-
-
-def describe_data(
-    dataset: Dataset, frames: Frames, held_out: Frames | None = None
-) -> dict[str, Any]:
-    """The data a model was trained on, and the mean of its labels, which is the baseline.
-
-    `held_out`: rounds on which only the uncertainty head was fitted. They count as seen; `frames`
-    does not include theirs.
-    """
-    rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
-    splits = {
-        split: [info.id for info in dataset.rounds if info.split == split]
-        for split in ("train", "test")
-    }
-    return {
-        "path": str(dataset.path),
-        "content_hash": dataset.content_hash,
-        "frames": len(frames),
-        "split": splits,
-        "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
-        "seeds": [info.seed for info in rounds],
-        "tracks": sorted({info.track for info in rounds}),
-        "mean": mean_labels(frames.labels),
-    }
-
-
-def mean_labels(labels: LabelArrays) -> dict[str, Any]:
-    """The mean of labels and their most frequent class; None for markings that are never active."""
-    distances = _known(labels.distances.astype(np.float64))
-    counts = (~np.isnan(distances)).sum(0)
-    sums = np.nansum(distances, axis=0)
-    offset = _known(tf.localise(distances))
-    known = labels.heading[labels.heading != UNKNOWN_HEADING]
-    classes = np.bincount(known, minlength=len(tf.RoadClass))
-    return {
-        "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
-        "to_lane_centre_m": float(np.nanmean(offset)) if not np.isnan(offset).all() else 0.0,
-        "angle_rad": float(labels.angle.astype(np.float64).mean()),
-        "heading": int(classes.argmax()),
-        "heading_share": [float(share) for share in classes / max(classes.sum(), 1)],
-    }
-
-
 # Groups of frames by which a model is evaluated.
 
 
@@ -162,14 +114,15 @@ GROUPS = {
     "by_speed": "speed",
 }
 SHADOW = (0.05, 0.3, 0.6)
-"""Limits of the share of the road within 30 m that lies in shadow."""
+"""Limits between groups of the share of the road within 30 m that lies in shadow."""
 RADIUS_M = (40.0, 80.0, 170.0)
-"""Limits of the radius of the bend; the heading class of a larger one is straight."""
+"""Limits between groups of the radius of the bend, m; a road with a larger radius has the class
+straight."""
 SPEED_KMH = (30.0, 45.0, 60.0)
 
 
 def groups(frames: Frames) -> Iterator[tuple[str, dict[str, NDArray[np.int64]]]]:
-    """Each grouping: its name in `GROUPS`, and the rows of each of its groups, in order.
+    """Yields, for each grouping, its name in `GROUPS` and the rows of its groups, in order.
 
     Each frame is in one group of every grouping.
     """
@@ -205,9 +158,9 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: LabelArrays, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on `outputs` (N, 9 to 22) for `labels`; `mean`: of `mean_labels`.
+    """The report on `outputs` (N, 9 to 22) for `labels`; `mean`: from `mean_labels`.
 
-    It has `uncertainty` when the model predicts standard deviations.
+    It has the key `uncertainty` when the model predicts standard deviations.
     """
     errors = signed_errors(outputs, labels.distances, labels.angle)
     heading = outputs[:, 6:OUTPUTS].argmax(1)
@@ -238,7 +191,7 @@ def evaluate_outputs(
 def evaluate_by_groups(
     outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on all frames, and on the groups of frames: `by_track`, ..."""
+    """The report on all frames, with reports on the groups of frames under `by_track`, ..."""
     labels = frames.labels
     report = evaluate_outputs(outputs, labels, mean)
     std = split_outputs(outputs).std
@@ -253,8 +206,8 @@ def evaluate_by_groups(
     return report
 
 
-def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
-    """Mean absolute errors and the accuracy of the class."""
+def _means(errors: NDArray[np.float64], right: NDArray[np.bool_]) -> dict[str, Any]:
+    """Mean absolute errors, and accuracy of the class."""
     sizes = [_mean(np.abs(column)) for column in errors.T]
     by_name = dict(zip(FEATURES, sizes, strict=True))
     return {
@@ -266,7 +219,7 @@ def _means(errors: Numbers, right: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def feature_mean(means: dict[str, Any], name: str) -> float | None:
-    """The mean of feature `name` among those of a report or of its `baseline` or `ratio`."""
+    """Mean error of feature `name` in a report, or in its `baseline` or `ratio`."""
     keys = {"to_lane_centre": "to_lane_centre_mae_m", "angle": "angle_mae_rad"}
     found: float | None = means[keys[name]] if name in keys else means["mae_m"][name]
     return found
@@ -280,11 +233,11 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
 
 
 def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float | None]:
-    """The losses of the paper's table on coded values, inactive ones included.
+    """The losses of the paper's table, on coded values, inactive ones included.
 
     `distance`, `angle`: mean over the frames of the squared error, summed over the five distances,
-    as trained; `distance_absolute`, `angle_absolute`: of the absolute error; `type`: cross-entropy
-    of the heading class, None where no frame tells it.
+    as in training; `distance_absolute`, `angle_absolute`: the same with the absolute error; `type`:
+    cross-entropy of the class, None where no frame has a known class.
     """
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
     known = ~np.isnan(target)
@@ -306,7 +259,8 @@ def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str,
 def presence(
     outputs: NDArray[np.float32], labels: LabelArrays
 ) -> dict[str, dict[str, float | None]]:
-    """Per distance: share of active labels predicted inactive, and of inactive ones as active."""
+    """By distance: share of active labels predicted as inactive, and of inactive ones predicted as
+    active."""
     distances, _ = tf.decode(outputs[:, :6])
     truth = labels.distances
     inactive = np.isnan(np.column_stack([distances, tf.localise(distances)]))
@@ -321,16 +275,18 @@ def presence(
     }
 
 
-def _baseline_errors(mean: dict[str, Any], labels: LabelArrays) -> Numbers:
-    """Errors (N, 7) of always predicting the training mean."""
+def _baseline_errors(mean: dict[str, Any], labels: LabelArrays) -> NDArray[np.float64]:
+    """Errors (N, 7) of the constant prediction `mean`."""
     distances = [np.nan if d is None else d for d in mean["distances_m"]]
     offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)
     angle = mean["angle_rad"] - labels.angle
-    return _known(np.column_stack([np.array(distances) - labels.distances, offset, angle]))
+    return nan_where_unknown(
+        np.column_stack([np.array(distances) - labels.distances, offset, angle])
+    )
 
 
-def _mean(values: Numbers) -> float | None:
-    """The mean of the values that are not NaN; None when there are none."""
+def _mean(values: NDArray[np.float64]) -> float | None:
+    """Mean of the values that are not NaN; None when there are none."""
     present = values[~np.isnan(values)]
     return float(present.mean()) if len(present) else None
 

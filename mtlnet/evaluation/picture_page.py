@@ -1,6 +1,5 @@
 """The evaluation on a user's own pictures as one HTML page: `mtlnet evaluate --data FOLDER --report
-FILE`. Each picture has its label (green) and the model's answer (orange) drawn in, the failures
-first."""
+FILE`. Each picture shows its label (green) and the model's answer (orange); failures come first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,13 +24,13 @@ from mtlnet.inference.overlay import (
 )
 from mtlnet.inference.prediction import split_outputs
 from mtlnet.inference.uncertainty import FEATURES as ANSWERS
-from runtime.files import atomic_write
+from runtime.files import atomic_write, name_as_text
 from runtime.html import embed_jpeg, format_number, format_percent, render
 from trackfeatures.camera import CameraParameters
 
 WIDTH_PX = 400
 ALONG_M = np.geomspace(2.0, 35.0, 40)
-"""Where along the road markings are drawn."""
+"""Positions along the road, m, between which markings are drawn."""
 TITLES = {
     "ml": "left (m)",
     "mr": "right (m)",
@@ -47,17 +46,17 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Case:
-    """One picture or copy of the page: `row` in the answers, or the reason why it has none."""
+    """A picture or copy on the page: its row in the answers, or the reason why it has none."""
 
     picture: LabelledPicture
     copy: str
     row: int | None
     verdict: str
-    """What went wrong in words; empty where nothing did."""
+    """What went wrong, in words; empty if nothing did."""
 
 
 def write_picture_page(path: Path, report: dict[str, Any], answers: Answers) -> Path:
-    """Write the page of `mtlnet.evaluation.pictures.picture_report`'s report to the file `path`."""
+    """Write the page for a report of `mtlnet.evaluation.pictures.picture_report` to `path`."""
     figures = report["pictures"]
     page = render(
         "mtlnet.evaluation",
@@ -125,10 +124,10 @@ def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def cases(answers: Answers) -> list[Case]:
-    """All pictures and copies, the failures first.
+    """All pictures and copies, failures first.
 
-    Refused ones, then those answered absent, then by the largest of their errors, each in units of
-    its feature's mean.
+    The order: refused ones, absent answers, then by the largest error in units of its feature's
+    mean error.
     """
     images = answers.images
     sizes = np.abs(answers.errors)
@@ -151,7 +150,7 @@ def cases(answers: Answers) -> list[Case]:
 
 
 def _figure(answers: Answers, case: Case) -> dict[str, Any]:
-    """Of a case: its picture with label and answer, and the texts of its caption."""
+    """Figure of a case: the picture with label and answer drawn in, and the caption."""
     picture, row = case.picture, case.row
     place = ", ".join(text for text in (picture.drive, picture.light) if text)
     name = picture.file if case.copy == "plain" else f"{picture.file}, {case.copy}"
@@ -169,20 +168,15 @@ def _figure(answers: Answers, case: Case) -> dict[str, Any]:
     image = _drawn(answers, case)
     return {
         "jpeg": embed_jpeg(image),
-        "name": _printable(name),
+        "name": name_as_text(name),
         "place": place,
         "verdict": case.verdict,
         "rows": texts,
     }
 
 
-def _printable(name: str) -> str:
-    """A file's name as text: bytes that are not UTF-8 as escapes."""
-    return name.encode("utf-8", "backslashreplace").decode()
-
-
 def _drawn(answers: Answers, case: Case) -> Image:
-    """The picture or copy, `WIDTH_PX` wide at most, with the label and the answer drawn in."""
+    """The picture or copy with label and answer drawn in, at most `WIDTH_PX` wide."""
     images, picture = answers.images, case.picture
     whole = read_whole_image(images.path / picture.file)
     scale = min(1.0, WIDTH_PX / whole.shape[1])
@@ -192,7 +186,7 @@ def _drawn(answers: Answers, case: Case) -> Image:
     if row is None:
         return small
     camera = source_camera(images, row).resized(*size)
-    taken = copied_camera(camera, case.copy)  # undoes the mirror, or does nothing
+    taken = copied_camera(camera, case.copy)  # undoes the mirroring, or changes nothing
     canvas = copied_picture(small, taken, case.copy).copy()
     curvature = -picture.curvature if case.copy == "mirrored" else picture.curvature
     answered, angle = tf.decode(answers.outputs[row : row + 1, :6])
@@ -209,6 +203,6 @@ def _drawn(answers: Answers, case: Case) -> Image:
 
 
 def source_camera(images: CustomImages, row: int) -> CameraParameters:
-    """The camera that took the picture or copy in a row, at its own size."""
+    """Camera of the picture or copy in a row, at its own size."""
     lens = images.lenses[row]
     return images.camera if lens is None else lens.source

@@ -1,7 +1,7 @@
-"""Judges a model on a user's own labelled pictures: `mtlnet evaluate --data FOLDER`.
+"""Evaluates a model on a user's own labelled pictures: `mtlnet evaluate --data FOLDER`.
 
-Lengths in m, the angle in rad. Errors are those of answers that are there: what a model answers
-"absent" is counted apart, and so is a picture that shows too little of the model's view.
+Lengths in m, the angle in rad. Errors are counted only where the model's answer has a value; absent
+answers are counted separately, and so are pictures that show too little of the model's view.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -24,48 +24,48 @@ GROUPS = {"by_drive": "drive", "by_light": "light", "by_copy": "copy", "by_train
 TRAINED, NOT_TRAINED = "trained on", "not trained on"
 UNNAMED = "not given"
 
-Numbers = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Answers:
-    """A model's answers on N labelled pictures."""
+    """A model's answers for N labelled pictures."""
 
     images: CustomImages
     outputs: NDArray[np.float32]
-    """(N, 9 to 22) in metres beside the pictures' cameras."""
-    true: Numbers
-    """(N, 5), NaN where the label has none or does not tell it."""
-    found: Numbers
-    """(N, 5), NaN where answered absent."""
+    """Outputs (N, 9 to 22) in metres at the pictures' own cameras."""
+    true: NDArray[np.float64]
+    """Labels (N, 5), NaN where absent or unknown."""
+    found: NDArray[np.float64]
+    """Answers (N, 5), NaN where absent."""
     trained: frozenset[str]
-    """SHA-256 of the files that the model was trained on."""
+    """SHA-256 of the picture files that the model was trained on."""
 
     @cached_property
     def trained_files(self) -> frozenset[str]:
-        """The files that the model was trained on."""
+        """Names of the files that the model was trained on."""
         pairs = zip(self.images.pictures, self.images.hashes, strict=True)
         return frozenset(picture.file for picture, found in pairs if found in self.trained)
 
     @property
-    def errors(self) -> Numbers:
-        """Answered minus true (N, 5)."""
+    def errors(self) -> NDArray[np.float64]:
+        """Answer minus label (N, 5)."""
         return self.found - self.true
 
     @property
     def absent(self) -> NDArray[np.bool_]:
-        """Where the lane is labelled and answered absent (N,)."""
+        """Whether the lane is labelled but answered as absent (N,)."""
         return np.isfinite(self.true[:, 0]) & np.isnan(self.found[:, 0])
 
     @property
     def foreign(self) -> NDArray[np.bool_] | None:
-        """Where the answer is called out of distribution (N,); None for a model without it."""
+        """Whether the answer is flagged as out of distribution (N,); None for a model without the
+        flag."""
         score = split_outputs(self.outputs).ood_score
         return None if score is None else ~(score <= 1)
 
     @property
-    def label_std(self) -> Numbers:
-        """Standard deviations of the labels (N, 7), as `mtlnet.inference.uncertainty.FEATURES`."""
+    def label_std(self) -> NDArray[np.float64]:
+        """Standard deviations of the labels (N, 7), in the order of
+        `mtlnet.inference.uncertainty.FEATURES`."""
         stds = [[p.std_m] * 6 + [p.std_rad] for p in self.images.pictures]
         return np.array(stds, np.float64)
 
@@ -73,7 +73,7 @@ class Answers:
 def judge(
     images: CustomImages, outputs: NDArray[np.float32], trained: Sequence[str] = ()
 ) -> Answers:
-    """The answers of `outputs` (N, 9 to 22), as the model gave them for the rectified images."""
+    """The answers for `outputs` (N, 9 to 22), the model's outputs for the rectified images."""
     outputs = images.outputs(outputs)
     distances, angle = tf.decode(outputs[:, :6])
     labels = images.labels
@@ -86,8 +86,9 @@ def judge(
     )
 
 
-def _features(distances: NDArray[Any], angle: NDArray[Any]) -> Numbers:
-    """(N, 5) as `FEATURES`, NaN where absent or unknown, of distances (N, 5) and angles (N,)."""
+def _features(distances: NDArray[Any], angle: NDArray[Any]) -> NDArray[np.float64]:
+    """Values (N, 5) of `FEATURES`, NaN where absent or unknown, from distances (N, 5) and angles
+    (N,)."""
     known = np.where(np.isinf(distances), np.nan, distances).astype(np.float64)
     offset = tf.localise(distances)
     offset = np.where(np.isinf(offset), np.nan, offset)
@@ -95,9 +96,9 @@ def _features(distances: NDArray[Any], angle: NDArray[Any]) -> Numbers:
 
 
 def picture_report(answers: Answers, mean: dict[str, Any]) -> dict[str, Any]:
-    """The report of `mtlnet.evaluation.metrics`, and in `pictures` that of this module.
+    """The report of `mtlnet.evaluation.metrics`, with that of this module under `pictures`.
 
-    `mean`: of `mtlnet.evaluation.metrics.mean_labels`, the baseline of the former.
+    `mean`: from `mtlnet.data.description.mean_labels`, the baseline of the former.
     """
     labels = answers.images.labels
     report = evaluate_outputs(answers.outputs, labels, mean)
@@ -105,7 +106,7 @@ def picture_report(answers: Answers, mean: dict[str, Any]) -> dict[str, Any]:
         report["uncertainty"]["coverage"] = _coverage(answers, slice(None))
     everything = part_report(answers, lambda picture, copy: True)
     groups = {name: dict(_groups(answers, name)) for name in GROUPS}
-    # A grouping of which nothing is told has no place in the report.
+    # A grouping without information is left out of the report.
     groups = {k: v for k, v in groups.items() if [*v] not in ([UNNAMED], [NOT_TRAINED])}
     label_std = answers.label_std
     about = {
@@ -123,7 +124,7 @@ def _pictures(answers: Answers) -> list[LabelledPicture]:
 
 
 def group_of(answers: Answers, name: str, picture: LabelledPicture, copy: str) -> str:
-    """The group of a picture's copy in the grouping `name` of `GROUPS`."""
+    """Group of a picture's copy in the grouping `name` of `GROUPS`."""
     if name == "by_copy":
         return copy
     if name == "by_training":
@@ -147,11 +148,12 @@ def _groups(answers: Answers, name: str) -> Iterator[tuple[str, dict[str, Any]]]
 
 
 def part_report(answers: Answers, chosen: Callable[[LabelledPicture, str], bool]) -> dict[str, Any]:
-    """The figures of the pictures and copies that are chosen.
+    """Figures of the chosen pictures and copies.
 
     `mean`, `median`: of the absolute errors; `mean_of_drives`: the mean of the drives' means;
     `always_median`: the mean error of always answering the median of these labels; `within_std`:
-    the share of errors within one predicted standard deviation, the label's variance added.
+    the share of errors within one standard deviation, the label's variance added to the predicted
+    one.
     """
     images = answers.images
     pairs = zip(images.pictures, images.copies, strict=True)
@@ -177,7 +179,7 @@ def part_report(answers: Answers, chosen: Callable[[LabelledPicture, str], bool]
 
 
 def _coverage(answers: Answers, rows: Any) -> dict[str, list[float | None]]:
-    """`mtlnet.evaluation.metrics.coverage`, with the labels' variance added to the model's."""
+    """`mtlnet.evaluation.metrics.coverage`, with the labels' variances added to the model's."""
     labels = answers.images.labels.take(rows)
     outputs = answers.outputs[rows]
     std = split_outputs(outputs).std
@@ -186,18 +188,18 @@ def _coverage(answers: Answers, rows: Any) -> dict[str, list[float | None]]:
     return coverage(np.hypot(std, answers.label_std[rows]), errors)
 
 
-def _over(statistic: Callable[[Any], Any], values: Numbers) -> Numbers:
-    """The statistic of each column's values that are not NaN; NaN without any."""
+def _over(statistic: Callable[[Any], Any], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Statistic of each column's values that are not NaN; NaN for a column without values."""
     columns = (column[~np.isnan(column)] for column in values.T)
     return np.array([statistic(c) if len(c) else np.nan for c in columns], np.float64)
 
 
-def _mean_of_drives(sizes: Numbers, drives: NDArray[np.str_]) -> Numbers:
+def _mean_of_drives(sizes: NDArray[np.float64], drives: NDArray[np.str_]) -> NDArray[np.float64]:
     means = [_over(np.mean, sizes[drives == drive]) for drive in np.unique(drives)]
     return _over(np.mean, np.array(means).reshape(-1, len(FEATURES)))
 
 
-def _named(values: Numbers) -> dict[str, float | None]:
+def _named(values: NDArray[np.float64]) -> dict[str, float | None]:
     return {
         name: None if np.isnan(value) else float(value)
         for name, value in zip(FEATURES, values, strict=True)

@@ -1,9 +1,9 @@
 """Evaluates a model as the paper does (Li et al., section VII), on rounds of `datagen protocol`:
 `mtlnet evaluate --protocol paper --data datasets/protocol`.
 
-Errors are mean absolute ones, in m and rad: of the offset from the middle of the one-lane road and
-of the yaw angle along whole drives and in four intervals of heavy shadow; the class on held-out
-rounds of nine tracks, whose whole report (`mtlnet.evaluation.metrics`) is given too.
+Errors are mean absolute errors, in m and rad: of the offset from the middle of the one-lane road
+and of the yaw angle, on whole drives and in four intervals of heavy shadow. The class is evaluated
+on held-out rounds of nine tracks, whose full report (`mtlnet.evaluation.metrics`) is included.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset, Frames, Labels, UndecodableImage
 from datagen.recording.names import MIDDLE, UNSEEN
 from mtlnet.data.model_labels import car_outputs
-from mtlnet.data.sources import require_decodable
+from mtlnet.data.rounds import require_decodable
 from mtlnet.evaluation.evaluate import about, predict_frames, require_fit
 from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
 from mtlnet.inference.engine import Engine
@@ -28,8 +28,8 @@ from trackfeatures.errors import UserError
 PAPER = "paper"
 INTERVALS = 4
 INTERVAL_FRAMES = 200
-"""10 s at 20 Hz. The paper marks four intervals of heavy shadow on its lap without their lengths;
-here the whole lap lies in shadow, so its darkest parts stand for them."""
+"""Number of frames, 10 s at 20 Hz. The paper marks four intervals of heavy shadow on its lap
+without their lengths; here the whole lap is in shadow, so its darkest parts stand for them."""
 FOUR = "four darkest intervals"
 DRIVES = {
     ("g-track-3", "heavy-shadow"): "g-track-3, heavy shadow",
@@ -43,7 +43,7 @@ STATED: dict[str, dict[str, float]] = {
     DRIVES["dirt-3", "clear"]: {"distance_m": 0.107, "angle_rad": 0.004},
     "nine tracks, held-out rounds": {"heading_accuracy": 0.9878},
 }
-"""What the paper states: in its text on g-track-3 and dirt-3, and of MTL 3 in its table II."""
+"""The paper's figures: on g-track-3 and dirt-3 from its text, of MTL 3 from its table II."""
 
 Rows = NDArray[np.int64]
 
@@ -57,10 +57,9 @@ def evaluate_protocol(
 ) -> dict[str, Any]:
     """The report on the held-out rounds; its entry `protocol` has the rows of the paper's table.
 
-    A row stands for a drive, a part of it or the held-out rounds; its `paper` holds what the paper
-    states.
-    `every`: evaluate every n-th frame only. Raises UserError for another protocol, for data
-    without these rounds, or for a model that was trained on them or on dirt-3.
+    A row is a drive, a part of one or the held-out rounds; its `paper` has the paper's figures.
+    `every`: evaluate every n-th frame only. Raises UserError for another protocol and for data
+    without these rounds, ModelError for a model that was trained on them or on dirt-3.
     """
     if protocol != PAPER:
         raise UserError(f"there is no protocol {protocol!r}; give {PAPER}")
@@ -75,7 +74,7 @@ def evaluate_protocol(
     try:
         outputs = car_outputs(predict_frames(engines, frames, report), frames)
     except UndecodableImage:
-        require_decodable(frames, data)  # to name and count all of them
+        require_decodable(frames, data)  # names and counts all of them
         raise
     driven = np.concatenate([*rows.values()])
     found = evaluate_by_groups(
@@ -93,8 +92,8 @@ def evaluate_protocol(
 
 
 def drive_rows(frames: Frames, data: Path) -> dict[str, Rows]:
-    """The frames of each drive of `DRIVES`, in their order. Raises UserError where one is missing,
-    or where there are no other rounds."""
+    """Rows of the frames of each drive of `DRIVES`, in order. Raises UserError where a drive is
+    missing, or where there are no other rounds."""
     labels = frames.labels
     found: dict[str, Rows] = {}
     for (track, light), name in DRIVES.items():
@@ -124,9 +123,10 @@ def protocol_rows(
     every: int,
     held_out: dict[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """The rows of the table: the drives, the four intervals of heavy shadow, and the nine tracks.
+    """The rows of the table: drives, four intervals of heavy shadow, held-out rounds of nine
+    tracks.
 
-    `outputs` (N, 9 to 22); `rows`: of `drive_rows`; `held_out`: the report on the other frames.
+    `outputs` (N, 9 to 22); `rows`: from `drive_rows`; `held_out`: the report on the other frames.
     """
     shaded = rows[SHADED]
     window = max(1, INTERVAL_FRAMES // every)
@@ -150,9 +150,12 @@ def protocol_rows(
 
 
 def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
-    """Up to `INTERVALS` intervals of `window` frames that do not overlap, in order: those with the
-    largest mean share of the road in shadow (N,), found one after the other. They are shorter where
-    N is too small for all of them wherever they lie."""
+    """Up to `INTERVALS` disjoint intervals of `window` frames, in order, with the largest mean
+    shadow.
+
+    `shadow` (N,): share of the road in shadow. The intervals are chosen one after another. They are
+    shorter where N is too small for all of them.
+    """
     window = max(1, min(window, len(shadow) // (2 * INTERVALS - 1)))
     sums = np.convolve(shadow.astype(np.float64), np.ones(window), mode="valid")
     starts: list[int] = []
@@ -164,11 +167,11 @@ def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
 
 
 def drive_figures(outputs: NDArray[np.float32], labels: Labels) -> dict[str, Any]:
-    """The figures of a drive or a part of it: those that the paper states, and some beside them.
+    """The figures of a drive or a part of one: those that the paper states, and some more.
 
-    `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest ones; `zero_...`:
-    those of always answering zero, the mean sizes of the labels; `absent`: frames without an
-    answered distance, which have no error; `heading_accuracy`: share of right classes.
+    `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest errors; `zero_...`:
+    the errors of always answering zero, which are the mean sizes of the labels; `absent`: frames
+    without an answered distance, which have no error; `heading_accuracy`: share of correct classes.
     """
     errors = np.abs(signed_errors(outputs, labels.distances, labels.angle))
     distance, angle = (errors[:, FEATURES.index(f)] for f in ("to_lane_centre", "angle"))

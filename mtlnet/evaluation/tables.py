@@ -20,19 +20,20 @@ DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
 
 
 def error_cells(result: dict[str, Any], name: str) -> list[str]:
-    """Of a feature's errors: mean, median, percentiles, that of the training mean, and ratio."""
+    """Cells of a feature's errors: mean, median, percentiles, the training mean's error, and
+    ratio."""
     baseline, ratio = (feature_mean(result[part], name) for part in ("baseline", "ratio"))
     sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), baseline]
     return [*(format_number(v, DIGITS[name]) for v in sizes), format_number(ratio, 2)]
 
 
 def mean_error_cells(result: dict[str, Any]) -> list[str]:
-    """The mean error of each feature."""
+    """Cells of the mean error of each feature."""
     return [format_number(result["errors"][f]["mean"], DIGITS[f]) for f in FEATURES]
 
 
 def report_tables(result: dict[str, Any]) -> list[Table]:
-    """The tables of a report of `mtlnet evaluate`: one for each part that the report has."""
+    """The tables of a report of `mtlnet evaluate`, one for each part of the report."""
     makers = {
         "protocol": protocol_table,
         "mae_m": evaluation_table,
@@ -44,7 +45,7 @@ def report_tables(result: dict[str, Any]) -> list[Table]:
 
 
 def evaluation_table(result: dict[str, Any]) -> Table:
-    """Errors of a model on active labels, beside those of the constant training mean."""
+    """Errors of a model on active labels, and those of the constant training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
     table = Table(title=escape(printable(title)))
     for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):
@@ -59,7 +60,7 @@ def evaluation_table(result: dict[str, Any]) -> Table:
 
 
 def protocol_table(result: dict[str, Any]) -> Table:
-    """The figures of the paper's protocol, the paper's in brackets; it fits in 80 columns."""
+    """Figures of the paper's protocol with the paper's own in brackets; fits in 80 columns."""
     title = f"{result['model']} by the paper's protocol (in brackets: the paper)"
     table = Table(title=escape(printable(title)))
     table.add_column("")
@@ -123,8 +124,8 @@ def _add_picture_row(
 
 
 def uncertainty_table(result: dict[str, Any]) -> Table:
-    """Shares of errors within one and two predicted standard deviations, and of frames that are
-    classified as out of distribution."""
+    """Shares of errors within one and two predicted standard deviations; share of frames classified
+    as out of distribution."""
     uncertainty = result["uncertainty"]
     share = (
         f"{uncertainty['out_of_distribution']:.1%} of the frames classified as out of distribution"
@@ -158,7 +159,7 @@ def prediction_table(predictions: list[dict[str, Any]]) -> Table:
 
 
 def export_lines(result: dict[str, Any]) -> str:
-    """The result of an export: its files, largest differences from torch, and the accuracy gate."""
+    """Result of an export: files, largest differences from torch, and the accuracy gate."""
     check, gate = result["check"], result.get("gate")
     lines = [
         f"{result['out']}: {', '.join(result['files'])}",

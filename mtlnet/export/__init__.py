@@ -1,1 +1,2 @@
-"""Writing a trained network for deployment: OpenVINO graph, int8, ONNX, published run folder."""
+"""Writing trained networks for deployment: OpenVINO graph, int8, ONNX, the model in a run's
+folder."""

@@ -1,11 +1,13 @@
 """`mtlnet export --model RUN --format onnx|openvino --precision f32|bf16|int8`.
 
-f32: as trained. bf16: large weights stored in bf16, converted to float32 where they are read. int8:
-OpenVINO only, see `mtlnet.export.int8`; the engine uses it by default once it has passed its
-accuracy gate on the test rounds. Each export is compared with torch on frames of a dataset.
+f32: as trained. bf16: large weights are stored in bf16 and converted to float32 where they are
+read. int8: only OpenVINO, see `mtlnet.export.int8`; the engine uses it by default once it has
+passed its accuracy gate on the test rounds. Each export is compared with torch on frames of a
+dataset.
 
-ONNX and OpenVINO models take any number of images at once (the first axis, "batch"), and answer
-each as alone. The int8 graph takes one, as the engine does: a graph for one image is quicker.
+ONNX and OpenVINO models take any number of images at once (first axis, "batch") and give the same
+answers as for single images. The int8 graph takes one image, as the engine does, because such a
+graph is faster.
 """
 
 import logging
@@ -17,8 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset
+from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.data.custom_images import LABELS, has_labels_file
-from mtlnet.data.sources import hold_out_rounds, select_rounds
+from mtlnet.data.rounds import hold_out_rounds, select_rounds
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (
     FLOAT_ACTIVATIONS,
@@ -27,7 +30,6 @@ from mtlnet.export.int8 import (
     judge,
     quantise,
 )
-from mtlnet.export.openvino_graph import TOLERANCE, build_graph, run_graph
 from mtlnet.inference.engine import EXPORT_FILE, best_precision, read_graph
 from mtlnet.inference.model_card import (
     GRAPH,
@@ -37,14 +39,13 @@ from mtlnet.inference.model_card import (
     ModelCard,
     ModelError,
     check_files,
-    file_hash,
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import read_uncertainty_head
-from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, load_network, predict_images
-from runtime.files import atomic_move, replaced_files, utf8_path, write_json
+from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph
+from runtime.files import atomic_move, file_hash, replaced_files, utf8_path, write_json
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
@@ -53,7 +54,7 @@ OPSET = 18
 MIN_BF16_VALUES = 256  # smaller constants stay in float32
 CHECK_BATCH = 3  # images at once
 MAX_CHECK_FRAMES = 10_000
-"""Their images are held in memory: 1.8 GB."""
+"""Maximum number of frames, whose images are held in memory (1.8 GB)."""
 
 
 def export_model(
@@ -64,10 +65,10 @@ def export_model(
     out: Path | None = None,
     frames: int = 64,
 ) -> dict[str, Any]:
-    """Write the model of `run` in another format and check it; returns what `--json` prints.
+    """Write the model of `run` in another format and check it; returns the result of `--json`.
 
-    It is checked on `frames` frames of the dataset `data`, by default the one it was trained on.
-    Raises UserError for an unsupported export, ModelError when the result differs from torch.
+    It is checked on `frames` frames of the dataset `data`, by default the training data. Raises
+    UserError for an unsupported export, ModelError when the result differs from torch.
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
@@ -119,8 +120,8 @@ def export_model(
 def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
     """The int8 form of a graph, and the numbers of the convolutions with float activations.
 
-    They are chosen on the rounds that fitted the uncertainty head, if they are of `dataset`; else
-    on a part of its train rounds, which the calibration then does not use.
+    These are chosen on the rounds that fitted the uncertainty head, if they belong to `dataset`;
+    otherwise on a part of the dataset's train rounds, which the calibration then does not use.
     """
     fitted = card.uncertainty or {}
     names = fitted.get("held_out", [])
@@ -135,7 +136,7 @@ def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tupl
 
 
 def _require_supported(kind: str, precision: str, out: Path | None, frames: int) -> None:
-    """Raise UserError for options of `export_model` that cannot be combined."""
+    """Raise UserError for an unsupported combination of options of `export_model`."""
     if kind not in FORMATS or precision not in PRECISIONS:
         raise UserError(
             f"there is no export to {kind} in {precision}; give --format "
@@ -157,9 +158,9 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
 
 
 class WithProbabilities(torch.nn.Module):
-    """A network with a softmax on its class scores: images (B, H, W, 3) uint8 -> (B, 9).
+    """A network with a softmax on its class scores: images uint8 (B, H, W, 3) -> (B, 9).
 
-    Of heads over bins a second result (B, 5): probabilities that markings are absent.
+    With heads over bins there is a second result (B, 5): probabilities that each marking is absent.
     """
 
     def __init__(self, network: Network) -> None:
@@ -167,7 +168,7 @@ class WithProbabilities(torch.nn.Module):
         self.network = network
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The nine outputs, and probabilities of absence where the heads give them."""
+        """The nine outputs, and the probabilities of absence if the heads give them."""
         x = self.network.forward_features(images)
         outputs = self.network.forward_heads(x)
         outputs = torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
@@ -180,7 +181,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
     """Write `model.onnx`, one file; `bf16`: large weights in bf16. Returns the file names."""
     import onnx
 
-    images = torch.zeros((2, HEIGHT, WIDTH, 3), dtype=torch.uint8)  # with 1, torch fixes it
+    images = torch.zeros((2, HEIGHT, WIDTH, 3), dtype=torch.uint8)  # torch would fix a size of 1
     path = folder / ONNX_FILE
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     program = torch.onnx.export(
@@ -209,7 +210,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
 
 
 def store_onnx_bf16(model: Any) -> None:
-    """Store large float32 weights of an ONNX model as bf16, with casts to float32 (in place)."""
+    """Store large float32 weights of an ONNX model in bf16, with casts to float32 (in place)."""
     import ml_dtypes
     import onnx
     from onnx import helper, numpy_helper
@@ -242,7 +243,8 @@ def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
 
 
 def store_openvino_bf16(model: Any) -> None:
-    """Store large float32 weights of an OpenVINO model as bf16, with converts (in place)."""
+    """Store large float32 weights of an OpenVINO model in bf16, with conversions to float32 (in
+    place)."""
     import openvino
     from openvino import opset13 as ops
 
@@ -262,9 +264,9 @@ def store_openvino_bf16(model: Any) -> None:
 def check_export(
     network: Network, path: Path, precision: str, images: NDArray[np.uint8]
 ) -> dict[str, Any]:
-    """Largest differences of the nine outputs, run by OpenVINO, from torch in float32.
+    """Largest differences of the nine outputs, computed by OpenVINO, from torch in float32.
 
-    The images are run in batches, but for int8, whose graph takes one.
+    The images are computed in batches, except for int8, whose graph takes one image.
     """
     computed = "f32" if precision == "f32" else best_precision()
     found = run_graph(path, computed, images, 1 if precision == "int8" else CHECK_BATCH)

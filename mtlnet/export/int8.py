@@ -1,11 +1,12 @@
-"""The int8 form of a graph (by NNCF), and the accuracy gate it must pass.
+"""The int8 form of a graph (by NNCF), and the accuracy gate that it must pass.
 
 Quantised are the weights of all convolutions and of the shared layers except the last, and the
 activations of most convolutions, calibrated on training frames. Which convolutions keep float
-activations is chosen on train rounds that were held out of the training, or of another dataset on
-a twelfth of its train rounds, by greedy forward selection until the gate is passed there. The gate
-itself judges on test rounds, which chose nothing. Shared layers take as long as reading their
-weights takes; the last is small, and costs as much accuracy as the other two.
+activations is chosen by greedy forward selection until the gate is passed on train rounds that were
+held out of the training (for another dataset: on a twelfth of its train rounds). The gate itself
+uses the test rounds, on which nothing is chosen. The fully connected layers are memory-bound. The
+last one is small but loses as much accuracy in int8 as the other two together, so it stays in
+float.
 """
 
 import logging
@@ -23,23 +24,24 @@ from datagen.recording import Frames
 from mtlnet.data.model_labels import model_labels
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.evaluation.metrics import evaluate_outputs
-from mtlnet.export.openvino_graph import run_graph
 from mtlnet.inference.engine import load_engine
+from mtlnet.openvino_graph import run_graph
 from runtime.processor import has_int8
 
 CALIBRATION_FRAMES = 300
 FLOAT_ACTIVATIONS: tuple[int, ...] = (0, 2)
-"""Numbers of the convolutions whose activations are not quantised, where nothing could be chosen:
-of the paper's network the first costs more distance accuracy than all others together, the third
-more angle accuracy."""
+"""Numbers of the convolutions with float activations where none can be chosen: in the paper's
+network the first costs more distance accuracy than all others together, the third more angle
+accuracy."""
 MAX_FLOAT_ACTIVATIONS, MAX_CONVOLUTIONS = 3, 16
-"""Most convolutions with float activations; most of a network whose choices are tried."""
+"""Maximum number of convolutions with float activations; maximum number of convolutions of a
+network for which the choice is made."""
 HELD_OUT_FRAMES = 4_000
 MARGIN = 0.5
-"""Share of the gate's limits that a choice may use up on the held-out rounds: the first of many
-choices that passes is likely to be a lucky one."""
+"""Share of the gate's limits that a choice may use on the held-out rounds, because the first choice
+that passes among many tends to be a lucky one."""
 LIMITS = {"distance_m": 0.003, "angle_rad": 0.0002, "accuracy": 0.001}
-"""Largest increase of an error over float32: m, rad, and share of the frames."""
+"""Maximum increase of an error over float32: m, rad, and share of the frames."""
 
 
 def calibration_images(train: Frames) -> NDArray[np.uint8]:
@@ -51,12 +53,13 @@ def calibration_images(train: Frames) -> NDArray[np.uint8]:
 def choose_float_activations(
     model: Any, images: NDArray[np.uint8], held_out: Frames, mean: dict[str, Any]
 ) -> tuple[int, ...]:
-    """Which convolutions keep float activations, chosen on held-out train rounds.
+    """Choose the convolutions that keep float activations, on held-out train rounds.
 
-    `images`: for the calibration; `mean`: of the training labels. The first choice that
-    stays within `MARGIN` of the gate's limits on these frames, else the one nearest to that. First
-    none, then each convolution alone, that with the fewest multiplications first, then the best of
-    these with each other one, and so on; of a network with very many, `FLOAT_ACTIVATIONS`.
+    `images`: for the calibration; `mean`: of the training labels. Returns the first choice that
+    stays within `MARGIN` of the gate's limits on these frames, or else the choice nearest to that.
+    The order: no convolution; each convolution alone, from the fewest multiplications up; the best
+    of these with each other one; and so on. A network with too many convolutions gets
+    `FLOAT_ACTIVATIONS`.
     """
     rows = np.linspace(0, len(held_out) - 1, min(HELD_OUT_FRAMES, len(held_out))).astype(np.int64)
     frames, labels = held_out.read_batch(rows), model_labels(held_out).take(rows)
@@ -83,7 +86,7 @@ def choose_float_activations(
 
 
 def convolutions_by_work(model: Any) -> list[int]:
-    """The numbers of a model's convolutions, that with the fewest multiplications first."""
+    """Numbers of a model's convolutions, from the fewest multiplications up."""
     operations = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
     work = [
         int(np.prod(list(op.get_output_shape(0))[2:])) * int(np.prod(list(op.get_input_shape(1))))
@@ -99,7 +102,7 @@ def quantise(
 
     `float_activations`: numbers of the convolutions whose activations are not quantised.
     """
-    # Without this NNCF sends usage statistics.
+    # Otherwise NNCF sends usage statistics.
     os.environ["NNCF_CI"] = "1"
     import nncf
 
@@ -120,7 +123,7 @@ def quantise(
 
 
 def operation_names(model: Any, kind: str) -> list[str]:
-    """Names of a model's operations of that type, in topological order."""
+    """Names of a model's operations of type `kind`, in topological order."""
     operations = model.get_ordered_ops()
     return [op.get_friendly_name() for op in operations if op.get_type_name() == kind]
 
@@ -128,7 +131,7 @@ def operation_names(model: Any, kind: str) -> list[str]:
 def float_weights(model: Any) -> list[str]:
     """Names of the MatMuls whose weights are not quantised.
 
-    These are the last shared layer, and those of the texture, which depend on no convolution.
+    These are the last shared layer and the texture's MatMuls, which depend on no convolution.
     """
     after: set[str] = set()
     for op in model.get_ordered_ops():
@@ -143,8 +146,8 @@ def float_weights(model: Any) -> list[str]:
 def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
     """Names of the operations whose activations are not quantised.
 
-    These are the `chosen` convolutions, and everything no convolution depends on: shared layers,
-    heads and texture features.
+    These are the `chosen` convolutions, and all operations that no convolution depends on: shared
+    layers, heads and texture features.
     """
     convolutions = operation_names(model, "Convolution")
     before = set(convolutions)
@@ -162,9 +165,9 @@ def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
 
 
 def judge(run: Path, data: Path) -> dict[str, Any]:
-    """The gate's result for a run's int8 graph, on the test rounds of a dataset.
+    """Result of the gate for a run's int8 graph, on the test rounds of a dataset.
 
-    With "native_int8": whether the processor on which it was judged multiplies int8 natively.
+    It also has "native_int8": whether the processor that judged it multiplies int8 natively.
     """
 
     def evaluated(precision: Literal["f32", "int8"]) -> dict[str, Any]:
@@ -177,9 +180,10 @@ def judge(run: Path, data: Path) -> dict[str, Any]:
 def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]:
     """Compare the evaluation of a quantised model with that in float32 on the same frames.
 
-    The result has "passed", "failed" (names), "split", "frames", "limits" and "worse" (name: error
-    increase). Each marking and the offset from the lane centre are held to the limit of a distance.
-    Features without labels are not judged; one that only one of the evaluations has fails.
+    The result has "passed", "failed" (names), "split", "frames", "limits" and "worse" (increase of
+    the error by name). Each marking and the offset from the lane centre must stay within the limit
+    of a distance. Features without labels are not judged; a feature that only one evaluation has
+    fails.
     """
     pairs = {
         **{name: (reference["mae_m"][name], value) for name, value in quantised["mae_m"].items()},
@@ -193,7 +197,7 @@ def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]
         if before is not None and after is not None
     }
     lost = [name for name, pair in pairs.items() if (pair[0] is None) != (pair[1] is None)]
-    # Written so that a NaN fails.
+    # In this form a NaN fails.
     failed = [name for name, by in worse.items() if not by <= _limit(name)]
     return {
         "passed": not failed and not lost and bool(worse),
@@ -206,5 +210,5 @@ def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]
 
 
 def _limit(name: str) -> float:
-    """The largest increase of the error of a feature, or of the share of wrong classes."""
+    """Maximum increase of the error of a feature, or of the share of wrong classes."""
     return LIMITS[{"angle": "angle_rad", "accuracy": "accuracy"}.get(name, "distance_m")]

@@ -1,8 +1,8 @@
-"""The model in a run's own folder, written when training ends: weights, OpenVINO graph, card.
+"""Publishes the model in a run's own folder when training ends: weights, OpenVINO graph, card.
 
-All files are put in place together, after the graph has been compared with torch on real frames,
-and the card last: a run without a card holds no finished model. Without OpenVINO no graph is
-written: an engine makes one of the weights when it loads the model.
+All files are moved into place together, after the graph has been compared with torch on real
+frames, and the card last: a run without a card has no finished model. Without OpenVINO no graph is
+written; an engine then builds it from the weights.
 """
 
 import platform
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 
 import trackfeatures as tf
-from mtlnet.export.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, run_graph, write_graph
+from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.inference.engine import best_precision, has_openvino
+from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
     GRAPH,
@@ -28,8 +29,6 @@ from mtlnet.inference.model_card import (
     WEIGHTS,
     ModelCard,
     ModelError,
-    file_hash,
-    golden_image,
 )
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import (
@@ -38,20 +37,21 @@ from mtlnet.inference.uncertainty import (
     texture_features,
     write_uncertainty_head,
 )
-from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, fold, predict_images, run_network
-from runtime.files import atomic_write, replaced_files
+from mtlnet.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, run_graph, write_graph
+from runtime.files import atomic_write, file_hash, replaced_files
 from trackfeatures.camera import CameraParameters
 from trackfeatures.names import to_name
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 LEAST_OOD_SCORE = 1e-3
-"""That of a model's only image is 0, but for rounding; from 1 on an image counts as unfamiliar."""
+"""Least out-of-distribution score in a comparison. The score of a model's only training image is 0
+apart from rounding; from 1 on an image counts as unfamiliar."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a network was trained; fields of the model card."""
+    """How a network was trained; these are fields of the model card."""
 
     camera: CameraParameters = field(default_factory=CameraParameters)
     alpha: tuple[float, float, float] = (0.3, 0.2, 0.5)
@@ -74,7 +74,7 @@ def publish(
     `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
     `uncertainty` the model predicts no standard deviations. Without OpenVINO the run gets no graph,
     and nothing is compared. Raises ModelError when the graph differs by more than the tolerances of
-    `mtlnet.export.openvino_graph`. After an error the run has the model that it had.
+    `mtlnet.openvino_graph`. After an error the run has the model that it had before.
     """
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
@@ -112,7 +112,7 @@ def publish(
 def _require_equal(run: Path, check: dict[str, float]) -> None:
     limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_uncertainty": UNCERTAINTY_TOLERANCE}
     for name, limit in limits.items():
-        if not check.get(name, 0.0) <= limit:  # written so that a NaN fails too
+        if not check.get(name, 0.0) <= limit:  # in this form a NaN fails too
             raise ModelError(
                 f"the exported graph {run / GRAPH} differs from torch by {check[name]:.2g} "
                 f"({name}), at most {limit:g} is expected: the model is not published; report this "
@@ -121,7 +121,7 @@ def _require_equal(run: Path, check: dict[str, float]) -> None:
 
 
 def export_text(check: Mapping[str, float]) -> str:
-    """What is printed of a card's `export_check`; it has no frames where OpenVINO is missing."""
+    """Text about a card's `export_check`; that has no frames where OpenVINO is missing."""
     if not check["frames"]:
         return "weights alone: OpenVINO, which writes the graph, is not installed"
     differences = [f"{name} {value:.2g}" for name, value in check.items() if name != "frames"]
@@ -137,8 +137,8 @@ def compare_graph(
     """Largest difference between torch in float32 and the run's graph, by precision.
 
     `openvino_PRECISION_max`: absolute, of the nine outputs and the probabilities of absence;
-    `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs; of an
-    out-of-distribution score to `LEAST_OOD_SCORE` at least.
+    `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs. The difference of
+    an out-of-distribution score is relative to at least `LEAST_OOD_SCORE`.
     """
     answers = run_network(network, images)
     textures = np.stack([texture_features(image) for image in images])
@@ -167,7 +167,7 @@ def compare_graph(
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Python and the packages that made the model."""
+    """Versions of Python and of the packages that made the model."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

@@ -1,8 +1,8 @@
 """`mtlnet ship --model RUN --out DIR`: a model as weights alone, in half the bytes.
 
-`model.safetensors` in float16, the uncertainty head in float32 and the card: all an engine needs
-(`mtlnet.inference.engine.read_graph`). Its answers are those of the rounded weights, and so are the
-card's. `write_page` adds a README.md with the figures of evaluations.
+The folder has `model.safetensors` in float16, the uncertainty head in float32 and the card: all
+that an engine needs (`mtlnet.inference.engine.read_graph`). Answers, and those in the card, are
+computed from the rounded weights. `write_page` adds a README.md with the figures of evaluations.
 """
 
 import json
@@ -16,9 +16,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from mtlnet.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.evaluation.metrics import GROUPS
-from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.inference.engine import Engine, has_openvino, load_engine
+from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
     UNCERTAINTY_WEIGHTS,
@@ -26,17 +27,15 @@ from mtlnet.inference.model_card import (
     ModelCard,
     ModelError,
     check_files,
-    file_hash,
-    golden_image,
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import write_uncertainty_head
 from mtlnet.inference.weights_file import read_weights
-from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import load_network, predict_images
+from mtlnet.openvino_graph import TOLERANCE
 from mtlnet.uncertainty_fit.head import refit_uncertainty_head
-from runtime.files import atomic_write
+from runtime.files import atomic_write, file_hash
 from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
 
@@ -45,11 +44,12 @@ CHECK_IMAGES = 4
 
 
 def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]:
-    """Write the model of `run` into the new folder `out`; what `--json` prints.
+    """Write the model of `run` to the new folder `out`; returns the result of `--json`.
 
-    `data`: a dataset on which its uncertainty head is fitted anew (`refit_uncertainty_head`).
-    Raises UserError when it cannot be made of weights alone or `out` has a model, ModelError when
-    the result does not answer as the run does, but for what rounding the weights makes of it.
+    `data`: a dataset on which the uncertainty head is fitted again (`refit_uncertainty_head`).
+    Raises UserError when the network cannot be rebuilt from weights alone or `out` has a model
+    already, ModelError when the answers differ from the run's by more than the rounding of the
+    weights.
     """
     card = read_card(run)
     if find_architecture(card.network).backbone:
@@ -86,7 +86,7 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
 
 
 def half(name: str, values: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Weights in float16; ModelError when one is beyond its range."""
+    """Weights in float16. Raises ModelError when one is outside its range."""
     with np.errstate(over="ignore"):
         rounded = values.astype(np.float16)
     if not np.isfinite(rounded).all():
@@ -107,7 +107,7 @@ def _card_of(out: Path, card: ModelCard, names: tuple[str, ...]) -> ModelCard:
 
 
 def _without_folders(data: dict[str, Any]) -> dict[str, Any]:
-    """The description of training data with the names of datasets, not this machine's folders."""
+    """The description of training data with names of datasets instead of paths on this machine."""
     named = {**data, "path": Path(data["path"]).name}
     if "earlier" in data:
         named["earlier"] = [{**one, "path": Path(one["path"]).name} for one in data["earlier"]]
@@ -115,9 +115,9 @@ def _without_folders(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check(run: Path, out: Path) -> dict[str, float]:
-    """Largest difference of what the shipped weights answer from torch, and from the run.
+    """Largest differences of the shipped weights' answers from torch, and from the run.
 
-    Without OpenVINO, which answers from them, torch's own answer is compared with the run's.
+    Without OpenVINO, torch's answers of the shipped weights are compared with the run's.
     """
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (CHECK_IMAGES, HEIGHT, WIDTH, 3), dtype=np.uint8)
@@ -132,24 +132,26 @@ def _check(run: Path, out: Path) -> dict[str, float]:
     }
     if not found["from_torch"] <= TOLERANCE:
         raise ModelError(
-            f"the weights in {out} answer as torch does but for {found['from_torch']:.2g}, at most "
+            f"the answers of the weights in {out} differ from torch by "
+            f"{found['from_torch']:.2g}, at most "
             f"{TOLERANCE:g} is expected; report this as a fault"
         )
     return found
 
 
 def _answers(engine: Engine, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """The outputs (N, 9) for N images."""
+    """Outputs (N, 9) for N images."""
     return np.stack([engine(image)[:OUTPUTS] for image in images])
 
 
 def write_page(
     model: Path, evaluations: Sequence[Path], notes: str = "", picture: Path | None = None
 ) -> Path:
-    """Write `README.md` into the model's folder: its card, `notes`, and the tables of evaluations.
+    """Write `README.md` to the model's folder: its card, `notes`, and the tables of evaluations.
 
-    `evaluations`: what `mtlnet evaluate --json` printed; `picture`: a JPEG of its worst frames,
-    which is copied there. Raises UserError for an evaluation of another model or unreadable.
+    `evaluations`: files with the output of `mtlnet evaluate --json`; `picture`: a JPEG of the worst
+    frames, which is copied to the folder. Raises UserError for an evaluation that is unreadable or
+    of another model.
     """
     card = read_card(model)
     found = [_read_evaluation(path, card) for path in evaluations]

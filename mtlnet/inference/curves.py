@@ -1,4 +1,4 @@
-"""Reading `curves.csv`, the training curves of a run: loss, learning rate and speed over steps."""
+"""Reads `curves.csv`, the training curves of a run: losses, learning rate and speed per step."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ HEADER = ",".join(COLUMNS) + "\n"
 def read_curves(path: Path) -> list[dict[str, float]]:
     """The rows of a `curves.csv` by column; none for a missing file or other columns.
 
-    Damaged rows are left out: a full disk or a power failure can truncate the last one.
+    Damaged rows are skipped: a full disk or a power failure can truncate the last one.
     """
     if not path.is_file():
         return []

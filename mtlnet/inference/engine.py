@@ -1,7 +1,7 @@
 """Inference engines: OpenVINO by default, torch in float32 as the reference.
 
-An engine takes one camera image, uint8 RGB; normalisation is part of the exported graph. torch is
-imported only when the torch engine is requested: the serving image does not contain it.
+An engine takes one camera image, uint8 RGB; normalisation is part of the graph. torch is imported
+only when the torch engine is requested: the image of the service does not contain it.
 """
 
 import json
@@ -23,10 +23,9 @@ from mtlnet.inference.model_card import (
     ModelCard,
     ModelError,
     check_files,
-    file_hash,
     read_card,
 )
-from runtime.files import utf8_path
+from runtime.files import file_hash, utf8_path
 from runtime.processor import has_int8
 
 EngineKind = Literal["openvino", "torch"]
@@ -36,22 +35,22 @@ INT8 = Path("export") / "openvino-int8"
 
 
 class Engine(Protocol):
-    """A model ready to run; must not be shared between threads."""
+    """A loaded model; it must not be shared between threads."""
 
     @property
     def card(self) -> ModelCard:
-        """The model's card."""
+        """Card of the model."""
 
     @property
     def kind(self) -> str:
-        """The library that runs it: "openvino" or "torch"."""
+        """Library that computes: "openvino" or "torch"."""
 
     @property
     def precision(self) -> str:
-        """The precision it computes in: "f32", "bf16" or "int8"."""
+        """Precision of the computation: "f32", "bf16" or "int8"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Image (H, W, 3) RGB of `card.camera`'s size -> outputs (9,) to (22,).
+        """Outputs (9,) to (22,) for an image (H, W, 3) RGB of the size of `card.camera`.
 
         `mtlnet.inference.prediction.decode_outputs` converts them to metres and radians. Raises
         ModelError for an image of another size or type.
@@ -70,7 +69,7 @@ def load_engine(
 
     `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate and
     fits this processor (`uses_int8`), else bf16 if the processor supports it, else float32. The
-    torch engine supports float32 only; with `gpu` it computes on a GPU where there is one. Raises
+    torch engine supports only float32; with `gpu` it computes on a GPU if there is one. Raises
     ModelError when the model is missing, unfinished or damaged.
     """
     card = read_card(run)
@@ -87,7 +86,7 @@ def load_engine(
 
 
 class OpenVinoEngine:
-    """The exported graph, compiled for this CPU; `precision` is the one it computes in."""
+    """The exported graph, compiled for this CPU."""
 
     kind = "openvino"
 
@@ -115,13 +114,12 @@ class OpenVinoEngine:
             reason = str(error).strip().splitlines()[-1]
             raise ModelError(f"OpenVINO cannot load the graph of {run}: {reason}") from error
         self._request = compiled.create_infer_request()
-        self._shape = tuple(compiled.input(0).shape)
-        self._input: NDArray[np.uint8] = np.empty(self._shape, np.uint8)
+        self._input: NDArray[np.uint8] = np.empty(tuple(compiled.input(0).shape), np.uint8)
         self._request.set_input_tensor(0, openvino.Tensor(self._input, shared_memory=True))
         self._output: NDArray[np.float32] = self._request.get_output_tensor(0).data
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        check_image(image, self._shape[1:])
+        self.card.check_image(image)
         self._input[0] = image
         self._request.infer()
         outputs: NDArray[np.float32] = self._output[0].copy()
@@ -129,13 +127,13 @@ class OpenVinoEngine:
 
 
 def _read_model(graph: Path) -> Any:
-    """Raises RuntimeError when OpenVINO cannot read it."""
+    """The OpenVINO model in a file. Raises RuntimeError when OpenVINO cannot read it."""
     with utf8_path(graph) as plain:
         return openvino_core().read_model(str(plain))
 
 
 def read_graph(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run: its graph or, if it holds weights alone, one built from these.
+    """The OpenVINO model of a run: its stored graph, or a graph built from its weights.
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
     """
@@ -152,11 +150,12 @@ def read_graph(run: Path, card: ModelCard) -> Any:
     return model_from_weights(card.network, read_weights(run / WEIGHTS), head)
 
 
-# The exports of a run, each with an `export.json` that `mtlnet export` writes.
+# Exports of a run. Each has an `export.json` of `mtlnet export`.
 
 
 def read_export(folder: Path) -> dict[str, Any] | None:
-    """The `export.json` of a folder, None if there is none; ModelError when it is damaged."""
+    """Content of the `export.json` of a folder; None if there is none. Raises ModelError when
+    damaged."""
     path = folder / EXPORT_FILE
     if not path.is_file():
         return None
@@ -172,9 +171,9 @@ def read_export(folder: Path) -> dict[str, Any] | None:
 def uses_int8(run: Path, card: ModelCard) -> bool:
     """Whether int8 is the default precision of a run on this processor.
 
-    The run has an int8 graph of the card's weights that passed its accuracy gate
-    (`mtlnet.export.int8`), and the processor multiplies int8 natively. One that does not may round
-    sums otherwise, and uses a graph only if that was judged on such a processor.
+    True if the run has an int8 graph of the card's weights that passed its accuracy gate
+    (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor that does not
+    may round sums differently, and uses a graph only if the gate was judged on such a processor.
     """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:
@@ -184,7 +183,8 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
 
 
 def int8_graph(run: Path, card: ModelCard) -> Path:
-    """Path of a run's int8 graph; ModelError if missing, damaged or made from other weights."""
+    """Path of a run's int8 graph. Raises ModelError if it is missing, damaged or of other
+    weights."""
     folder = run / INT8
     about = read_export(folder)
     how = f"make it with `mtlnet export --model {run} --format openvino --precision int8`"
@@ -200,30 +200,31 @@ def int8_graph(run: Path, card: ModelCard) -> Path:
 
 
 def parse_kind(text: str) -> EngineKind:
-    """The engine kind called `text`; ModelError for an unknown one."""
+    """The kind of engine called `text`. Raises ModelError for an unknown one."""
     if text not in get_args(EngineKind):
         raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
     return cast(EngineKind, text)
 
 
 def parse_precision(text: str | None) -> Precision | None:
-    """The precision called `text`, None for the default; ModelError for an unknown one."""
+    """The precision called `text`; None for the default. Raises ModelError for an unknown one."""
     if text not in (None, *get_args(Precision)):
         raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
     return cast(Precision | None, text)
 
 
 def has_openvino() -> bool:
-    """Whether OpenVINO is installed. Without it models are trained and evaluated by torch alone."""
+    """Whether OpenVINO is installed. Without it, models are trained and evaluated by torch
+    alone."""
     return find_spec("openvino") is not None
 
 
 def openvino_core() -> Any:
-    """The `openvino.Core` of this process; use no other one.
+    """The only `openvino.Core` of this process.
 
     OpenVINO's CPU plugin gives the thread that loads it an alternate signal stack (`sigaltstack`).
-    It unmaps that stack when its last user is dropped, in whichever thread; a later signal then
-    ends the process with SIGSEGV. This core keeps the plugin loaded.
+    It unmaps that stack when the last user of the plugin is dropped, in any thread; a later signal
+    then ends the process with SIGSEGV. This core keeps the plugin loaded.
     """
     with _core_lock:
         return _make_core()
@@ -245,12 +246,3 @@ def best_precision() -> Precision:
     """bf16 if this CPU supports it natively (AVX512-BF16 or AMX), else float32."""
     capabilities = openvino_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     return "bf16" if "BF16" in capabilities else "f32"
-
-
-def check_image(image: NDArray[np.uint8], shape: tuple[int, ...]) -> None:
-    """Raise ModelError unless `image` is uint8 of `shape` (height, width, 3)."""
-    if image.shape != tuple(shape) or image.dtype != np.uint8:
-        raise ModelError(
-            f"the image is {image.dtype} of shape {image.shape}; this model takes uint8 RGB of "
-            f"shape {tuple(shape)} (height, width, 3): scale it first"
-        )

@@ -1,12 +1,12 @@
 """A network as an OpenVINO graph, built operation by operation from architecture and weights.
 
-Free of torch. Nothing is traced or converted: an implementation independent of torch's, with
-OpenVINO's own SAME padding, and a folder of weights is all that an engine needs.
+Free of torch, and nothing is traced or converted: it is an implementation independent of torch's,
+with OpenVINO's own SAME padding. An engine therefore needs only a folder with weights.
 
-The heads and the uncertainty head are computed in float32 also where the rest is in bf16. OpenVINO
-rounds the results of a MatMul to bf16, in steps of 0.004 near 1, which is 0.025 m and 0.005 rad;
-element-wise operations at the end of a graph stay in float32. The directions of the texture are a
-MatMul all the same: the distance, the sum of their squares, is wrong by 0.1 % then, 0.5 % at most.
+The heads and the uncertainty head are computed in float32 even where the rest is in bf16. OpenVINO
+rounds the results of a MatMul to bf16, in steps of 0.004 near 1, which is 0.025 m or 0.005 rad;
+element-wise operations at the end of a graph stay in float32. The directions of the texture remain
+a MatMul: their result, a sum of squares, is then wrong by 0.1 %, at most 0.5 %.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.architecture import (
+    ABSENT_ABOVE,
+    ANGLE_BINS,
+    BIN_VARIANCE,
+    DISTANCE_BINS,
+    HEIGHT,
+    NEAR,
+    PAIR,
+    WIDTH,
+    Architecture,
+    Conv,
+    LocalNorm,
+    Pool,
+    find_architecture,
+)
 from mtlnet.inference.graph_operations import (
     columns,
     count_values,
@@ -25,21 +40,6 @@ from mtlnet.inference.graph_operations import (
 )
 from mtlnet.inference.uncertainty import UncertaintyHead
 from mtlnet.inference.uncertainty_graph import uncertainty_outputs
-from mtlnet.model.architecture import (
-    ABSENT_ABOVE,
-    ANGLES,
-    BIN_VARIANCE,
-    HEIGHT,
-    NEAR,
-    PAIR,
-    PLACES,
-    WIDTH,
-    Architecture,
-    Conv,
-    LocalNorm,
-    Pool,
-    find_architecture,
-)
 from trackfeatures.coding import OFFSET, SPAN
 
 MARKINGS = len(tf.MARKINGS)
@@ -48,12 +48,12 @@ Weights = Mapping[str, NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Nodes:
-    """A network's nodes that others build on."""
+    """Nodes of a network on which other parts of a graph build."""
 
     images: Any  # uint8 (B, H, W, 3)
-    uncertainty_inputs: Any  # (B, F): the last shared features and, of bins, the log spreads
+    uncertainty_inputs: Any  # (B, F): last shared features; for bins, log spreads too
     outputs: Any  # (B, 9): see `mtlnet.inference.prediction`
-    absent: Any = None  # (B, 5), of heads over bins: probabilities that markings are absent
+    absent: Any = None  # (B, 5), for bins: probabilities that each marking is absent
 
 
 def network_nodes(
@@ -63,10 +63,10 @@ def network_nodes(
     features: Callable[[Any], Any] | None = None,
     batch: int = 1,
 ) -> Nodes:
-    """The nodes of a folded network with these `weights`, named as in torch.
+    """Nodes of a folded network with these `weights`, named as in torch.
 
-    `features`: what makes features of pixels, where these layers are none of the architecture's.
-    `batch`: images at once, -1: any number, which is slower for one.
+    `features`: computes the features from the pixels; None: the architecture's own layers. `batch`:
+    number of images; -1: any number, which is slower for a single image.
     """
     images = ops.parameter([batch, HEIGHT, WIDTH, 3], np.uint8, name="images")
     first_row = architecture.first_row
@@ -89,7 +89,7 @@ def network_nodes(
     )
     coded, inputs, absent = [distance, angle], x, None
     if architecture.bins:
-        scores = ops.reshape(distance, np.array([-1, PLACES + 1]), special_zero=False)
+        scores = ops.reshape(distance, np.array([-1, DISTANCE_BINS + 1]), special_zero=False)
         absent = absent_probabilities(ops, scores)
         coded = [read_bins(ops, scores, angle, absent)]
         inputs = ops.concat([x, *_log_spreads(ops, scores, angle)], 1)
@@ -98,9 +98,9 @@ def network_nodes(
 
 
 def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
-    """The OpenVINO model uint8 (B, 210, 280, 3) -> float32 (B, 9).
+    """OpenVINO model uint8 (B, 210, 280, 3) -> float32 (B, 9).
 
-    With `head` 8 columns more; then, of heads over bins, 5 more.
+    `head` adds 8 columns; then heads over bins add 5.
     """
     import openvino
     from openvino import opset13 as ops
@@ -116,14 +116,14 @@ def model_of(nodes: Nodes, head: UncertaintyHead | None = None) -> Any:
 
 
 def model_from_weights(network: str, weights: Weights, head: UncertaintyHead | None = None) -> Any:
-    """The OpenVINO model of the network of that name with these weights."""
+    """OpenVINO model of the network with this name and these weights."""
     from openvino import opset13 as ops
 
     return model_of(network_nodes(ops, find_architecture(network), weights), head)
 
 
 def convolutions(ops: Any, x: Any, architecture: Architecture, weights: Weights) -> Any:
-    """The layers before the shared ones, (B, 3, H - first_row, W) -> (B, C, h, w)."""
+    """Layers before the shared ones, (B, 3, H - first_row, W) -> (B, C, h, w)."""
     for number, spec in enumerate(architecture.features):
         if isinstance(spec, LocalNorm):
             x = ops.lrn(x, np.array([1]), spec.alpha, spec.beta, 1.0, spec.size)
@@ -152,7 +152,7 @@ def convolution(
     groups: int = 1,
     **how: str,
 ) -> Any:
-    """A convolution with a kernel (F, C, k, k), without bias."""
+    """Convolution with a kernel (F, C, k, k), without bias."""
     convolve = ops.convolution
     if groups > 1:
         outputs, inputs, *kernel = weight.shape
@@ -168,44 +168,46 @@ def _pool(ops: Any, x: Any, spec: Pool) -> Any:
 
 
 def _linear(ops: Any, x: Any, weights: Weights, name: str) -> Any:
-    # Given as an array, it would be made a list of numbers first, which takes longer than the rest.
+    # A plain array would first be converted to a list of numbers, which takes longer than the rest.
     product = ops.matmul(x, ops.constant(weights[f"{name}.weight"]), False, True)
     return ops.add(product, weights[f"{name}.bias"][None])
 
 
 def absent_probabilities(ops: Any, scores: Any) -> Any:
-    """Probabilities (B, 5) that markings are absent, of the scores (5 B, PLACES + 1)."""
-    absent = _rows(ops, columns(ops, ops.softmax(scores, 1), PLACES, PLACES + 1))
+    """Probabilities (B, 5) that each marking is absent, from scores (5 B, DISTANCE_BINS + 1)."""
+    absent = _rows(ops, columns(ops, ops.softmax(scores, 1), DISTANCE_BINS, DISTANCE_BINS + 1))
     # `ml` and `mr` are absent together.
     pair = ops.reduce_mean(columns(ops, absent, 0, PAIR.stop), np.array([1]), keep_dims=True)
     return ops.concat([pair] * PAIR.stop + [columns(ops, absent, PAIR.stop, MARKINGS)], 1)
 
 
 def read_bins(ops: Any, scores: Any, angle: Any, absent: Any) -> Any:
-    """Coded answers (B, 6) of the scores of distances (5 B, PLACES + 1) and angle (B, ANGLES).
+    """Coded answers (B, 6) from the scores of the distances and of the angle.
 
-    `absent` (B, 5): probabilities that markings are absent.
+    `scores` (5 B, DISTANCE_BINS + 1), `angle` (B, ANGLE_BINS); `absent` (B, 5): probabilities that
+    each marking is absent.
     """
-    found = _rows(ops, _expectation(ops, columns(ops, scores, 0, PLACES), PLACES))
+    found = _rows(ops, _expectation(ops, columns(ops, scores, 0, DISTANCE_BINS), DISTANCE_BINS))
     spans = [tf.RANGES[name] for name in tf.MARKINGS]
     ends = np.array([[float(span.inactive != span.lo) for span in spans]], np.float32)
     limits = np.array(ABSENT_ABOVE, np.float32)[None]
     shares = ops.select(ops.greater(absent, limits), ends, found)
-    row = ops.concat([shares, _expectation(ops, angle, ANGLES)], 1)
+    row = ops.concat([shares, _expectation(ops, angle, ANGLE_BINS)], 1)
     return ops.add(ops.multiply(row, np.float32(SPAN)), np.float32(OFFSET))
 
 
 def _rows(ops: Any, column: Any) -> Any:
-    """(5 B, 1) -> (B, 5)."""
+    """Values (B, 5) from a column (5 B, 1)."""
     return ops.reshape(column, np.array([-1, MARKINGS]), special_zero=False)
 
 
 def _expectation(ops: Any, scores: Any, count: int) -> Any:
-    """Shares (N, 1) in [0, 1] of scores (N, count): the mean within NEAR bins of the likeliest."""
+    """Expectation (N, 1) in [0, 1] of scores (N, count), over the bins within NEAR of the
+    likeliest."""
     axis = np.array([1])
     number = np.arange(count, dtype=np.float32)[None]
     highest = ops.reduce_max(scores, axis, keep_dims=True)
-    # The first of the highest, as torch's argmax: all others count as far away.
+    # The first bin with the highest score, as torch's argmax; the other bins get `count`.
     places = ops.select(ops.equal(scores, highest), number, np.float32(count))
     best = ops.reduce_min(places, axis, keep_dims=True)
     near = ops.less_equal(ops.abs(ops.subtract(number, best)), np.float32(NEAR))
@@ -217,13 +219,13 @@ def _expectation(ops: Any, scores: Any, count: int) -> Any:
 
 
 def _log_spreads(ops: Any, scores: Any, angle: Any) -> list[Any]:
-    """As `mtlnet.model.bins.log_spreads`: (B, 5) of the distances and (B, 1) of the angle."""
-    distances = _log_spread(ops, columns(ops, scores, 0, PLACES), PLACES)
-    return [_rows(ops, distances), _log_spread(ops, angle, ANGLES)]
+    """`mtlnet.model.bins.log_spreads`: (B, 5) of the distances and (B, 1) of the angle."""
+    distances = _log_spread(ops, columns(ops, scores, 0, DISTANCE_BINS), DISTANCE_BINS)
+    return [_rows(ops, distances), _log_spread(ops, angle, ANGLE_BINS)]
 
 
 def _log_spread(ops: Any, scores: Any, count: int) -> Any:
-    """(N, 1) of scores (N, count)."""
+    """Logarithm (N, 1) of the standard deviation, in bins, of scores (N, count)."""
     axis = np.array([1])
     number = np.arange(count, dtype=np.float32)[None]
     share = ops.softmax(scores, 1)

@@ -1,11 +1,10 @@
-"""The card of a trained model (`card.json`), and how a run's folder is found and checked.
+"""The card of a trained model (`card.json`); how the folder of a run is found and checked.
 
-A run's folder holds `card.json`, `config.json`, `model.safetensors` (the network's weights, batch
+The folder of a run contains `card.json`, `config.json`, `model.safetensors` (the weights, batch
 normalisation folded), `uncertainty.safetensors` (the uncertainty head), `model.xml` and `model.bin`
 (the OpenVINO graph), `curves.csv`, `checkpoints/` and `tensorboard/`.
 """
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.files import write_json
+from runtime.files import file_hash, write_json
 from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError, require_version
 from trackfeatures.names import require_name
@@ -30,11 +29,10 @@ SHIPPED_FILES = {
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 5  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
-SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230, 230, 225)
 
 
 class ModelError(UserError):
-    """A model that is missing, unfinished or damaged, or that does not fit the image or data."""
+    """A model is missing, unfinished or damaged, or does not fit the image or the data."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class ModelCard:
 
     name: str
     network: str
-    """A name of `mtlnet.model.architecture.ARCHITECTURES`."""
+    """A name of `mtlnet.architecture.ARCHITECTURES`."""
     definitions_version: str
     program_version: str
     camera: CameraParameters
@@ -53,20 +51,29 @@ class ModelCard:
     batch: int
     seed: int
     data: dict[str, Any]
-    """The dataset it was trained on."""
+    """Description of the training data (`mtlnet.data.description`)."""
     versions: dict[str, str]
     files: dict[str, str]
-    """SHA-256 in hex, by file name."""
+    """SHA-256 of each file, in hex."""
     export_check: dict[str, float]
     golden: tuple[float, ...]
-    """Outputs (9,) of torch in float32 for `golden_image`."""
+    """Outputs (9,) of torch in float32 for the golden image (`mtlnet.inference.golden_image`)."""
     uncertainty: dict[str, Any] | None
-    """How the uncertainty head was fitted; None for a model without one."""
+    """Description of the fit of the uncertainty head; None for a model without one."""
 
     @property
     def model_hash(self) -> str:
         """SHA-256 of the weights; part of every response of the service."""
         return self.files[WEIGHTS]
+
+    def check_image(self, image: NDArray[np.uint8]) -> None:
+        """Raise ModelError unless `image` is uint8 (H, W, 3) of the camera's size."""
+        shape = (self.camera.height, self.camera.width, 3)
+        if image.shape != shape or image.dtype != np.uint8:
+            raise ModelError(
+                f"the image is {image.dtype} of shape {image.shape}; this model takes uint8 RGB of "
+                f"shape {shape} (height, width, 3): scale it first"
+            )
 
     def write(self, run: Path) -> None:
         """Write `card.json`, atomically."""
@@ -106,7 +113,7 @@ def read_card(run: Path) -> ModelCard:
         raise ModelError(f"{path} is damaged ({error!r}); train the model anew") from error
     require_version(card.definitions_version, f"the model in {run}")
     if run == SHIPPED and card.files != SHIPPED_FILES:
-        raise ModelError(f"{run} holds not the weights that ship with this version; install again")
+        raise ModelError(f"{run} does not hold the weights of this version; install again")
     return card
 
 
@@ -124,17 +131,11 @@ def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
             )
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def resolve_run(name: str | Path, runs: Path = RUNS) -> Path:
     """The folder of a run given as a path, a name in `runs/`, "latest" or "default".
 
-    "default" is the model shipped with the project or, while there is none, the latest run. Links
-    are resolved in the result.
+    "default" is the model shipped with the project; without one, the latest run. Symbolic links are
+    resolved.
     """
     if str(name) == "default":
         if (SHIPPED / CARD).is_file():
@@ -159,25 +160,3 @@ def _latest(runs: Path, why: str) -> Path:
             f"{why}, and there is no {latest}; train a model with `mtlnet train`, or give a run"
         )
     return latest.resolve()
-
-
-def golden_image(width: int, height: int) -> NDArray[np.uint8]:
-    """A straight one-lane road under a clear sky, uint8 RGB (height, width, 3).
-
-    Every model is published with its outputs for this image; the service compares its own with them
-    at start. Drawn in integers, so that it is the same on every machine.
-    """
-    image = np.empty((height, width, 3), np.uint8)
-    horizon = height // 2
-    image[:horizon] = SKY
-    image[horizon:] = GRASS
-    # Twice the offset from the middle column, and twice the road's half width in that row, which
-    # increases linearly below the horizon, as that of a flat road.
-    offset = np.abs(2 * np.arange(width) - (width - 1))[None, :]
-    depth = np.arange(1, height - horizon + 1)[:, None]
-    half_width = depth * 5 * width // (3 * (height - horizon))
-    road = image[horizon:]
-    road[offset <= half_width] = ASPHALT
-    painted = (offset <= half_width * 8 // 10) & (offset >= half_width * 76 // 100)
-    road[painted] = PAINT
-    return image

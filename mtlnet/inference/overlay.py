@@ -1,4 +1,4 @@
-"""Overlay of predicted and true markings on a frame, beside a view of the car from above.
+"""Draws predicted and true markings over a frame, beside a view of the car from above.
 
 Flat road. Car frame: x ahead, y left (m).
 """
@@ -22,9 +22,10 @@ NEAR_M, FAR_M = 3.0, 14.0
 SCALE = 2
 """Factor by which frames are enlarged, so that lines look thin."""
 LINE_SHARE = 200
-"""Rows of an image per pixel of a line's width."""
+"""Number of image rows per pixel of line width."""
 MAX_PX = 1e4
-"""Points that are projected farther outside the image are left out: OpenCV would overflow."""
+"""Limit of projected points, px; points farther outside the image are left out, because OpenCV
+would overflow."""
 TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 
 
@@ -33,8 +34,8 @@ def marking_line(
 ) -> NDArray[np.float64]:
     """Points (N, 2) of a marking `distance` m to the right of the car, m in the car frame.
 
-    `angle`: of the car to the track, rad; `curvature` of the track: 1/m, left positive; `at` (N,):
-    where along the track, m; None: 24 points ahead of the car.
+    `angle`: of the car to the track, rad; `curvature` of the track: 1/m, positive to the left; `at`
+    (N,): positions along the track, m; None: 24 points ahead of the car.
     """
     along = np.linspace(NEAR_M, FAR_M, 24) if at is None else np.asarray(at, np.float64)
     left = curvature * along**2 / 2 - distance
@@ -45,13 +46,12 @@ def marking_line(
 def to_pixels(
     points: NDArray[np.float64], camera: CameraParameters, height_m: float
 ) -> NDArray[np.int32]:
-    """Pixels (M, 2), enlarged by `SCALE`, of those road points (N, 2) in the car frame that the
-    camera sees. `height_m`: its height above the road.
-    """
+    """Pixels (M, 2), enlarged by `SCALE`, of the road points (N, 2) in the car frame that the
+    camera sees. `height_m`: its height above the road."""
     road = np.column_stack([points, np.full(len(points), camera.z - height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
-    enlarged = (pixels + 0.5) * SCALE - 0.5  # about the picture's corner, as cv2.resize does
+    enlarged = (pixels + 0.5) * SCALE - 0.5  # about the corner of the picture, like cv2.resize
     return np.round(enlarged).astype(np.int32)
 
 
@@ -63,10 +63,10 @@ def draw_overlay(
     truth: tuple[Distances, float],
     prediction: tuple[Distances, float],
 ) -> Image:
-    """The enlarged frame (H, W, 3) RGB beside a top view: truth green, prediction orange.
+    """The enlarged frame (H, W, 3) RGB beside a view from above: truth green, prediction orange.
 
-    `truth` and `prediction` are distances (m) and the angle (rad). Both are drawn with the road's
-    true curvature, which is not predicted.
+    `truth` and `prediction`: distances (m) and angle (rad). Both are drawn with the road's true
+    curvature, which is not predicted.
     """
     size = (frame.shape[1] * SCALE, frame.shape[0] * SCALE)
     canvas = cv2.resize(frame, size, interpolation=cv2.INTER_CUBIC)
@@ -86,9 +86,9 @@ def draw_overlay(
 
 
 def draw_markings(image: Image, camera: CameraParameters, prediction: Prediction) -> Image:
-    """A copy of an image (H, W, 3) RGB of `camera` with the markings drawn, in its own size.
+    """A copy of an image (H, W, 3) RGB of `camera` with the markings drawn, at its own size.
 
-    Flat and straight road: the curvature is not predicted.
+    For a flat and straight road, because the curvature is not predicted.
     """
     canvas = image.copy()
     width = max(round(image.shape[0] / LINE_SHARE), 1)
@@ -106,7 +106,7 @@ def draw_road_line(
     colour: tuple[int, int, int],
     thickness: int,
 ) -> None:
-    """Draw points (N, 2) of the road, m in the car frame, as far as the camera sees them."""
+    """Draw points (N, 2) of the road, m in the car frame, where the camera sees them."""
     road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < MAX_PX).all(1)]

@@ -1,4 +1,4 @@
-"""Decoding a model's outputs into track features, in metres and radians.
+"""Decodes a model's outputs to track features, in metres and radians.
 
 Units and signs are those of `trackfeatures`: distances are negative to the left, the lateral offset
 is positive to the left, the angle is positive when the car points to the right of the track.
@@ -17,36 +17,35 @@ from mtlnet.inference.uncertainty import COLUMNS, FEATURES
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
 MARKINGS = len(tf.MARKINGS)
 ROAD_CLASSES = tuple(heading.name.lower() for heading in tf.RoadClass)
-# Each optional part, and whether an image's outputs have it, by their number.
+# Whether outputs have uncertainty and absence columns, by their number of columns.
 _HAS = {
     OUTPUTS + with_uncertainty * COLUMNS + with_absent * MARKINGS: (with_uncertainty, with_absent)
     for with_uncertainty in (False, True)
     for with_absent in (False, True)
 }
-Numbers = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class OutputParts:
-    """The parts of a model's outputs; of N images, all have a first axis (N, ...)."""
+    """Parts of a model's outputs; for N images each has a first axis (N, ...)."""
 
-    coded: Numbers
-    """(..., 6): five distances and the angle."""
-    heading: Numbers
-    """(..., 3): probability of each class."""
-    std: Numbers | None
-    """(..., 7): standard deviations; None for a model without an uncertainty head."""
-    ood_score: Numbers | None
-    """(...): above 1 out of distribution; None as `std`."""
-    absent: Numbers | None
-    """(..., 5): probabilities that markings are absent; None for heads of coded values."""
+    coded: NDArray[np.float32]
+    """Coded values (..., 6): five distances and the angle."""
+    heading: NDArray[np.float32]
+    """Probability of each class (..., 3)."""
+    std: NDArray[np.float32] | None
+    """Standard deviations (..., 7); None for a model without an uncertainty head."""
+    ood_score: NDArray[np.float32] | None
+    """Out-of-distribution score (...), above 1 out of distribution; None as for `std`."""
+    absent: NDArray[np.float32] | None
+    """Probability that each marking is absent (..., 5); None for heads of coded values."""
 
 
-def split_outputs(outputs: Numbers) -> OutputParts:
-    """The parts of outputs (..., 9 to 22): the nine, then the optional ones in this order.
+def split_outputs(outputs: NDArray[np.float32]) -> OutputParts:
+    """Split outputs (..., 9 to 22): nine outputs, then uncertainty (8) and absence (5) if present.
 
-    Columns of `mtlnet.inference.uncertainty`; probabilities that markings are absent. ValueError
-    for another number of columns.
+    The uncertainty columns are those of `mtlnet.inference.uncertainty`. Raises ValueError for
+    another number of columns.
     """
     width = outputs.shape[-1] if outputs.ndim else 0
     if width not in _HAS:
@@ -73,17 +72,17 @@ class Prediction:
     """
 
     distances_m: dict[str, float | None]
-    """By marking; None where the marking is absent."""
+    """Distance by marking; None where the marking is absent."""
     to_lane_centre_m: float | None
-    """Left positive; None where no marking is near."""
+    """Offset from the lane's centre, positive to the left; None where no marking is near."""
     angle_rad: float
     heading: dict[str, float]
-    """Probability of each class."""
+    """Probability of each class of the road, by name."""
     std: dict[str, float | None] | None = None
     """Standard deviation of the error of each of `mtlnet.inference.uncertainty.FEATURES`, m or rad;
     None for an absent feature."""
     out_of_distribution: bool | None = None
-    """Whether the image differs from the training images more than those from each other."""
+    """Whether the image differs from the training images more than these differ from each other."""
     absent: dict[str, float] | None = None
     """Probability that each marking is absent; None for a model with heads of coded values."""
 
@@ -93,7 +92,7 @@ class Prediction:
         return max(self.heading, key=self.heading.__getitem__)
 
     def as_json(self) -> dict[str, Any]:
-        """The prediction as the service returns it."""
+        """The prediction as JSON, in the form of the service's answer."""
         return {
             "distances_m": dict(self.distances_m),
             "to_lane_centre_m": self.to_lane_centre_m,
@@ -105,8 +104,8 @@ class Prediction:
         }
 
 
-def decode_outputs(outputs: Numbers) -> Prediction:
-    """Decode one image's outputs, (9,) to (22,); ValueError as `split_outputs`."""
+def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
+    """Decode the outputs (9,) to (22,) of one image. Raises ValueError as `split_outputs`."""
     if outputs.ndim != 1:
         raise ValueError(f"the outputs of one image have one axis, not shape {outputs.shape}")
     parts = split_outputs(outputs)

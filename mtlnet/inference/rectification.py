@@ -1,11 +1,11 @@
-"""Images of another camera as the model's camera would take them, and answers in metres again.
+"""Rectifies images of another camera to the model's camera; converts answers back to metres.
 
-Each pixel of the model's view is looked up where the other camera, with its lens and its mount,
-sees the same direction of the car's frame: exact for any scene, since the eye stays where it is
-(Hartley and Zisserman 2004, section 8.4). So the picture has the heading of the car, however the
-camera is turned in it. What the camera does not show is grey, as in training. A camera at another
-height sees a flat road enlarged: what is answered for it in metres is scaled by the ratio of the
-heights.
+Each pixel of the model's view is looked up where the other camera, with its lens and mount, sees
+the same direction in the car's frame. This is exact for any scene, because the optical centre does
+not move (Hartley and Zisserman 2004, section 8.4). The rectified picture therefore looks along the
+car, whatever the camera's mount. Areas that the camera does not show are grey, as in training. A
+camera at another height sees a flat road enlarged, so answers in metres are scaled by the ratio of
+the heights.
 """
 
 from dataclasses import dataclass, replace
@@ -24,19 +24,19 @@ from trackfeatures.coding import OFFSET, SPAN
 
 CAMERA_FILE = "camera.yaml"
 LEAST_SHOWN = 0.25
-"""Share of the model's rows, and of its columns, that an image must show."""
+"""Least share of the model's rows, and of its columns, that an image must show."""
 LEAST_ROAD = 0.1
-"""Share of the model's rows below the horizon that an image must show."""
+"""Least share of the model's rows below the horizon that an image must show."""
 COMMON_LANE_M = 3.6
 SEEN_LANES_M = (2.75, 4.4)
-"""Widths of lanes in training, m beside the model's camera. A camera at a height from which a
-common lane looks wider or narrower is out of distribution."""
+"""Range of lane widths in training, m at the model's camera. A camera at a height that makes a
+common lane look wider or narrower is out of distribution."""
 BORDER_LEVEL = 128
-"""Grey level of what an image does not show: nearly 0 to the network, as its padding."""
+"""Grey level of areas that an image does not show: almost 0 for the network, like its padding."""
 TOLERANCE = 0.01
 HEIGHT_SCORE = 2.0
 """Least `ood_score` of an image of a camera that is too high or too low."""
-OUTSIDE = -1e4  # of every image, px
+OUTSIDE = -1e4  # outside every image, px
 KEPT_MAPS = 16
 
 Metres = NDArray[np.float64]
@@ -44,7 +44,7 @@ Metres = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rectification:
-    """From the images of one camera to those of another, at the same place of the car or not.
+    """Maps images of one camera to those of another, at the same or another place of the car.
 
     `source` took the images, at any size of its aspect ratio; `target`, without distortion, is the
     model's camera.
@@ -53,30 +53,30 @@ class Rectification:
     source: CameraParameters
     target: CameraParameters
     any_height: bool = False
-    """Whether no height is out of distribution: a recorded round's was drawn together with the
-    width of its lanes."""
+    """Whether every height is in distribution, as in recorded rounds, whose camera heights were
+    drawn together with their lane widths."""
 
     @property
     def scale(self) -> float:
-        """Metres beside the source per metre beside the target."""
+        """Metres at the source per metre at the target."""
         return self.source.height_above_road_m / self.target.height_above_road_m
 
     @property
     def view(self) -> CameraParameters:
-        """The camera that takes the rectified images from where the source is."""
+        """The camera that takes the rectified images from the place of the source."""
         source = self.source
         return replace(self.target, x=source.x, y=source.y, z=source.z)
 
     def image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An image (H, W, 3) of the source as uint8 (target.height, target.width, 3).
 
-        Raises ImageError when it is of another aspect ratio or shows too little.
+        Raises ImageError when it has another aspect ratio or shows too little.
         """
         height, width = image.shape[:2]
         source, target = self.source, self.target
         self.check(width, height)
         ratio = target.focal_px / (source.focal_px * height / source.height)
-        if ratio < 1:  # averaged first: sampling alone would leave out pixels
+        if ratio < 1:  # averaged first: sampling alone would skip pixels
             size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         seen = source.resized(image.shape[1], image.shape[0])
@@ -103,8 +103,8 @@ class Rectification:
         return found.astype(np.uint8, copy=False)
 
     def check(self, width: int, height: int) -> None:
-        """Raise ImageError unless images of that size, px, are the source's and show enough of the
-        target's view."""
+        """Raise ImageError unless images of this size, px, have the source's aspect ratio and show
+        enough of the target's view."""
         source = self.source
         stretch = width * source.height / (height * source.width)
         if abs(stretch - 1) > TOLERANCE:
@@ -128,11 +128,12 @@ class Rectification:
                 )
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, 9 to 22) for rectified images, for the car of the source.
+        """A model's outputs (N, 9 to 22) for rectified images, converted to the car of the source.
 
-        Distances and their standard deviations change, which hold that of the source's height too;
-        what is absent stays so. The angle needs no change: the rectified view looks along the car.
-        All images of a camera too high or too low (`SEEN_LANES_M`) are out of distribution.
+        Distances change, and so do their standard deviations, which include that of the source's
+        height; absent ones stay absent. The angle does not change, because the rectified view looks
+        along the car. All images of a camera that is too high or too low (`SEEN_LANES_M`) are out
+        of distribution.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)
@@ -155,9 +156,11 @@ class Rectification:
         return changed
 
     def labels(self, distances: NDArray[np.float32], angle: NDArray[np.float32]) -> Metres:
-        """Distances (N, 5) in m as the model has to answer them for rectified images, NaN where
-        absent, of cars of the source with `distances` and `angle` (N,) rad: `outputs` turned
-        round."""
+        """Targets of the distances (N, 5), m, for rectified images, NaN where absent.
+
+        `distances`, `angle` (N,) rad: labels of cars with the source camera. The inverse of
+        `outputs`.
+        """
         beside_camera = distances + _aside(self.source, angle)
         found: Metres = beside_camera / self.scale - _aside(self.target, angle)
         return found
@@ -168,15 +171,16 @@ _WIDTH = np.array([tf.RANGES[name].hi for name in tf.MARKINGS]) - _LOW
 
 
 def _aside(camera: CameraParameters, angle: NDArray[np.floating]) -> Metres:
-    """How far left of the centre of gravity, across the road, a camera is (N, 1), m, on cars that
-    point `angle` (N,) rad to the right of the road."""
+    """Offset (N, 1), m, of a camera to the left of the centre of gravity, across the road, for cars
+    that point `angle` (N,) rad to the right of the road."""
     left: Metres = camera.y * np.cos(angle) - camera.x * np.sin(angle)
     return left[:, None]
 
 
 @lru_cache(maxsize=KEPT_MAPS)
 def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.float32]:
-    """The source's pixel (2, H, W) of each pixel of the target; `OUTSIDE` where it sees nothing."""
+    """The source's pixel (2, H, W) for each pixel of the target; `OUTSIDE` where it shows
+    nothing."""
     columns, rows = np.meshgrid(np.arange(target.width), np.arange(target.height))
     rays = target.rays(np.column_stack([columns.ravel(), rows.ravel()]))
     places = rays @ target.rotation() + (source.x, source.y, source.z)
@@ -188,7 +192,7 @@ def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.floa
 def _fixed_maps(
     source: CameraParameters, target: CameraParameters
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """`_maps` as OpenCV's fixed-point maps."""
+    """`_maps` as fixed-point maps of OpenCV."""
     u, v = _maps(source, target)
     coarse, fine = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
@@ -196,8 +200,8 @@ def _fixed_maps(
 
 @lru_cache(maxsize=KEPT_MAPS)
 def shown_shares(source: CameraParameters, target: CameraParameters) -> tuple[float, float, float]:
-    """Shares of the target's rows, its columns, and its rows below a level road's horizon of which
-    the source shows anything."""
+    """Shares of the target's rows, of its columns, and of its rows below a level road's horizon, of
+    which the source shows a part."""
     u, v = _maps(source, target)
     inside = (u >= -0.5) & (u <= source.width - 0.5) & (v >= -0.5) & (v <= source.height - 0.5)
     rows, columns = inside.any(1), inside.any(0)

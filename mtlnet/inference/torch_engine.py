@@ -1,4 +1,4 @@
-"""The reference engine: the network in torch, float32. The exported graph is compared with it.
+"""The reference engine: the network in torch, float32, with which the exported graph is compared.
 
 The only module of `mtlnet.inference` that imports torch.
 """
@@ -9,39 +9,37 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtlnet.inference.engine import Precision, check_image
 from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, ModelCard, check_files
 from mtlnet.inference.uncertainty import read_uncertainty_head, texture_features
 from mtlnet.model.network import load_network, run_network
 
 
 class TorchEngine:
-    """The network and its uncertainty head in float32; see `mtlnet.inference.engine.Engine`."""
+    """The network and its uncertainty head in float32, as a `mtlnet.inference.engine.Engine`."""
 
     kind = "torch"
+    precision = "f32"
 
     def __init__(self, run: Path, card: ModelCard, threads: int = 1, *, gpu: bool = False) -> None:
-        """`gpu`: compute on a GPU where there is one."""
+        """`gpu`: compute on a GPU if there is one."""
         has_head = card.uncertainty is not None
         check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
         torch.set_num_threads(threads)
         self.card = card
-        self.precision: Precision = "f32"
         self.on_gpu = gpu and torch.cuda.is_available()
         self._network = load_network(run / WEIGHTS, card.network)
         if self.on_gpu:
-            torch.backends.cudnn.allow_tf32 = False  # by default convolutions round to 10 bits
+            torch.backends.cudnn.allow_tf32 = False  # TF32, the default, rounds to 10 bits
             self._network.to("cuda")
         self._head = read_uncertainty_head(run) if has_head else None
-        self._shape = (card.camera.height, card.camera.width, 3)
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        check_image(image, self._shape)
+        self.card.check_image(image)
         result: NDArray[np.float32] = self.batch(image[None])[0]
         return result
 
     def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The outputs (B, 9) to (B, 22) for images (B, H, W, 3) at once."""
+        """Outputs (B, 9) to (B, 22) for images (B, H, W, 3)."""
         answers = run_network(self._network, images)
         parts = [answers.outputs]
         if self._head is not None:

@@ -1,18 +1,19 @@
 """The uncertainty head: a standard deviation for each feature, and an out-of-distribution score.
 
-Standard deviations: two layers on the network's last shared features (256,), on the logarithms of
-the spreads (6,) where its heads are distributions over bins, and on the light of the image (10,)
-(`light_features`), all standardised, predict the logarithm of the standard deviation of the error
-of each of `FEATURES` (Nix and Weigend 1994). Without the light they are too large in dusk and fog
-and too small in snow and heavy shadow. The network's nine outputs do not change.
+Standard deviations: two layers predict the logarithm of the standard deviation of the error of each
+of `FEATURES` (Nix and Weigend 1994). Their inputs, all standardised, are the network's last shared
+features (256,), the logarithms of the spreads (6,) if its heads are distributions over bins, and
+the light of the image (10,) (`light_features`). Without the light the standard deviations are too
+large in dusk and fog and too small in snow and heavy shadow. The network's nine outputs do not
+change.
 
-Out-of-distribution (OOD) score: the larger of two values, each scaled so that 1 is the limit of
+Out-of-distribution (OOD) score: the larger of two values. Each is scaled so that 1 is the limit of
 what counts as known.
 
 - The squared Mahalanobis distance of the image's texture features from those of the training frames
-  (Lee et al. 2018). Not of the last shared features: a network trained on roads maps other images
-  near their mean. Measured on a model of 230 steps at 1 % false alarms: the last features detect
-  1 % of noise and text images, the texture features all of them.
+  (Lee et al. 2018). The last shared features do not serve: a network trained on roads maps other
+  images near their mean. Measured on a model of 230 steps at 1 % false alarms: the last features
+  detect 1 % of noise and text images, the texture features all of them.
 - The square of the camera's pitch offset, predicted by two layers from the texture features of the
   image centre: a camera that looks up or down sees the same textures slightly higher or lower.
 
@@ -32,52 +33,53 @@ from mtlnet.inference.weights_file import read_weights
 from runtime.files import atomic_write
 
 FEATURES = (*tf.MARKINGS, "to_lane_centre", "angle")
-"""Features with a standard deviation: m, and rad for the angle."""
+"""Features that have a standard deviation, in m, and in rad for the angle."""
 COLUMNS = len(FEATURES) + 1
 CELL_ROWS, CELL_COLUMNS = 14, 8
-BANDS = 3  # bands in the height of a cell; the pitch is predicted from those of the image centre
+BANDS = 3  # bands per cell; the pitch is predicted from the bands of the image centre
 CENTRE_BANDS, CENTRE_COLUMNS = slice(9, 33), slice(2, 6)
 PLANES = 5
 CELL_VALUES = PLANES * CELL_ROWS * CELL_COLUMNS
 CENTRE_VALUES = PLANES * 24 * 4
 TEXTURE_VALUES = CELL_VALUES + CENTRE_VALUES
-HALVES = 2  # the rows of an image above and below its middle
+HALVES = 2  # upper and lower half of an image
 LIGHT_VALUES = PLANES * HALVES
 LIGHT_LIMIT = 3.0
-"""Light that is more standard deviations from the usual one counts as so many: nothing is known of
-the errors there, above all by a model of one scene."""
+"""Light features are clipped to this number of standard deviations of the training set, because the
+head cannot extrapolate beyond them, especially for a model of one scene."""
 SQRT_EPSILON = 1e-6
-"""Added to a mean difference before its square root; the difference is 0 in a flat cell."""
-
-Numbers = NDArray[np.float32]
+"""Added to a mean difference before the square root; the difference is 0 in a flat cell."""
 
 
 @dataclass(frozen=True)
 class UncertaintyHead:
-    """Weights: F features, H hidden units, D = len(FEATURES), C cell and M centre values."""
+    """Weights of the head: F inputs, H hidden units, D = len(FEATURES), C cell and M centre
+    values."""
 
-    centre: Numbers  # (F,)
-    scale: Numbers  # (F,) z = (x - centre) * scale
-    hidden_weight: Numbers  # (H, F)
-    hidden_bias: Numbers  # (H,)
-    weight: Numbers  # (D, H)
-    bias: Numbers  # (D,) log(standard deviation) of m and rad
-    low: Numbers  # (D,) lower limit of that logarithm: unfamiliar images give extreme values
-    high: Numbers  # (D,) upper limit
-    texture_mean: Numbers  # (C,)
-    texture_directions: Numbers  # (C, C) distance = |directions (cells - mean)|^2; > 1: OOD
-    pitch_centre: Numbers  # (M,)
-    pitch_scale: Numbers  # (M,)
-    pitch_hidden_weight: Numbers  # (H, M)
-    pitch_hidden_bias: Numbers  # (H,)
-    pitch_weight: Numbers  # (1, H)
-    pitch_bias: Numbers  # (1,)
+    centre: NDArray[np.float32]  # (F,)
+    scale: NDArray[np.float32]  # (F,) z = (x - centre) * scale
+    hidden_weight: NDArray[np.float32]  # (H, F)
+    hidden_bias: NDArray[np.float32]  # (H,)
+    weight: NDArray[np.float32]  # (D, H)
+    bias: NDArray[np.float32]  # (D,) log(standard deviation) of m and rad
+    low: NDArray[np.float32]  # (D,) lower limit of the logarithm, against extreme values
+    high: NDArray[np.float32]  # (D,) upper limit of the logarithm
+    texture_mean: NDArray[np.float32]  # (C,)
+    texture_directions: NDArray[
+        np.float32
+    ]  # (C, C) distance = |directions (cells - mean)|^2; > 1: OOD
+    pitch_centre: NDArray[np.float32]  # (M,)
+    pitch_scale: NDArray[np.float32]  # (M,)
+    pitch_hidden_weight: NDArray[np.float32]  # (H, M)
+    pitch_hidden_bias: NDArray[np.float32]  # (H,)
+    pitch_weight: NDArray[np.float32]  # (1, H)
+    pitch_bias: NDArray[np.float32]  # (1,)
 
-    def predict(self, x: Numbers, textures: Numbers) -> Numbers:
+    def predict(self, x: NDArray[np.float32], textures: NDArray[np.float32]) -> NDArray[np.float32]:
         """Standard deviations and the OOD score, (N, D + 1).
 
         `x` (N, X): the network's inputs of this head; `textures` (N, C + M): see
-        `texture_features`. A head fitted on fewer inputs reads the first ones.
+        `texture_features`. A head fitted on fewer inputs reads only the first ones.
         """
         count = x.shape[1]
         if len(self.centre) > count:
@@ -91,14 +93,15 @@ class UncertaintyHead:
         ood_score = np.maximum((projected**2).sum(1, keepdims=True), pitch**2)
         return np.concatenate([np.exp(log_std), ood_score], 1).astype(np.float32)
 
-    def pitch_offset(self, centre: Numbers) -> Numbers:
-        """Pitch of the camera relative to the training camera, (N, 1), down positive.
+    def pitch_offset(self, centre: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Pitch of the camera relative to the training camera, (N, 1), positive downwards.
 
-        From the centre part of the texture features (N, M); 1 is the limit of what counts as known.
+        `centre` (N, M): the texture features of the image centre. 1 is the limit of what counts as
+        known.
         """
         z = (centre - self.pitch_centre) * self.pitch_scale
         hidden = np.maximum(z @ self.pitch_hidden_weight.T + self.pitch_hidden_bias, 0)
-        offset: Numbers = hidden @ self.pitch_weight.T + self.pitch_bias
+        offset: NDArray[np.float32] = hidden @ self.pitch_weight.T + self.pitch_bias
         return offset
 
 
@@ -106,15 +109,16 @@ TENSOR_NAMES = {"texture_mean": "usual", "texture_directions": "directions"} | {
     f"pitch_{name}": f"aim_{name}"
     for name in ("centre", "scale", "hidden_weight", "hidden_bias", "weight", "bias")
 }
-"""Names of fields in the file, where they differ."""
+"""Tensor names in the file that differ from the fields' names."""
 
 
-def texture_features(image: NDArray[np.uint8]) -> Numbers:
-    """Texture features (C + M,) of an image (H, W, 3): all cells, then the bands of the centre.
+def texture_features(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Texture features (C + M,) of an image (H, W, 3): those of all cells, then of the centre's
+    bands.
 
-    Each has mean colours, and the square roots of the mean absolute differences of brightness
-    between neighbouring pixels, across and down. H and W: multiples of the numbers of bands and
-    columns.
+    Each cell or band has mean colours, and the square roots of the mean absolute differences of
+    brightness between horizontal and vertical neighbours. H and W must be multiples of the numbers
+    of bands and columns.
     """
     pixels = image.astype(np.float32) * np.float32(1 / 127.5) - 1
     grey = pixels.mean(2, keepdims=True)
@@ -133,34 +137,36 @@ def texture_features(image: NDArray[np.uint8]) -> Numbers:
     )
 
 
-def standardise(x: Numbers, centre: Numbers, scale: Numbers, count: int) -> Numbers:
-    """What the standard deviations are predicted from, x (N, F), standardised.
+def standardise(
+    x: NDArray[np.float32], centre: NDArray[np.float32], scale: NDArray[np.float32], count: int
+) -> NDArray[np.float32]:
+    """Standardised inputs (N, F) of the standard deviations.
 
-    The first `count` values are the network's, the others the light, which is limited.
+    The first `count` values are the network's; the others are the light, which is clipped.
     """
-    z: Numbers = (x - centre) * scale
+    z: NDArray[np.float32] = (x - centre) * scale
     z[:, count:] = z[:, count:].clip(-LIGHT_LIMIT, LIGHT_LIMIT)
     return z
 
 
-def light_features(textures: Numbers) -> Numbers:
-    """Means (N, LIGHT_VALUES) over the cells of each half of an image, of textures (N, C + M): of
-    each texture plane above the middle, then below it."""
+def light_features(textures: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Light features (N, LIGHT_VALUES) from textures (N, C + M): the mean of each texture plane
+    over the upper half, then over the lower half of the image."""
     cells = textures[:, :CELL_VALUES].reshape(len(textures), PLANES, HALVES, -1)
-    light: Numbers = cells.mean(3).reshape(len(textures), LIGHT_VALUES)
+    light: NDArray[np.float32] = cells.mean(3).reshape(len(textures), LIGHT_VALUES)
     return light
 
 
 @dataclass(frozen=True)
 class FittedUncertainty:
-    """An uncertainty head and how it was fitted, for the model card."""
+    """An uncertainty head and the description of its fit, for the model card."""
 
     head: UncertaintyHead
     about: dict[str, Any]
 
 
 def write_uncertainty_head(run: Path, head: UncertaintyHead) -> None:
-    """Write a run's uncertainty head, atomically."""
+    """Write the uncertainty head of a run, atomically."""
     from safetensors.numpy import save
 
     arrays = {
@@ -171,7 +177,7 @@ def write_uncertainty_head(run: Path, head: UncertaintyHead) -> None:
 
 
 def read_uncertainty_head(run: Path) -> UncertaintyHead:
-    """The uncertainty head of the model in `run`; ModelError when it is damaged."""
+    """The uncertainty head of the model in `run`. Raises ModelError when it is damaged."""
     path = run / UNCERTAINTY_WEIGHTS
     names = {tensor: field for field, tensor in TENSOR_NAMES.items()}
     try:

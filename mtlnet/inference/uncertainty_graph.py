@@ -1,6 +1,6 @@
 """The uncertainty head and the out-of-distribution score as parts of an OpenVINO graph.
 
-The same numbers as `mtlnet.inference.uncertainty`, in float32 also where the network is in bf16.
+The same values as `mtlnet.inference.uncertainty`, in float32 even where the network is in bf16.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ from mtlnet.inference.uncertainty import (
 
 
 def uncertainty_outputs(ops: Any, x: Any, images: Any, head: UncertaintyHead) -> list[Any]:
-    """`UncertaintyHead.predict` of inputs x (B, X) and images (B, H, W, 3), uint8."""
+    """Nodes of `UncertaintyHead.predict` for inputs x (B, X) and images uint8 (B, H, W, 3)."""
     cells, centre = texture_graph(ops, images)
     count = min(count_values(x), len(head.centre))
     z = _standardise(ops, columns(ops, x, 0, count), head, slice(0, count))
@@ -55,7 +55,8 @@ def _standardise(ops: Any, x: Any, head: UncertaintyHead, part: slice) -> Any:
 
 
 def light_graph(ops: Any, cells: Any) -> Any:
-    """`mtlnet.inference.uncertainty.light_features` (B, LIGHT_VALUES) of cells (B, C)."""
+    """Nodes of `mtlnet.inference.uncertainty.light_features`, (B, LIGHT_VALUES), for cells (B,
+    C)."""
     shape = np.array([-1, LIGHT_VALUES, count_values(cells) // LIGHT_VALUES])
     halves = ops.reshape(cells, shape, special_zero=False)
     if not is_of_one_image(cells):
@@ -64,9 +65,10 @@ def light_graph(ops: Any, cells: Any) -> Any:
 
 
 def texture_graph(ops: Any, images: Any) -> tuple[Any, Any]:
-    """`mtlnet.inference.uncertainty.texture_features` of images (B, H, W, 3): (B, C) and (B, M)."""
+    """Nodes of `mtlnet.inference.uncertainty.texture_features`, (B, C) and (B, M), for images (B,
+    H, W, 3)."""
     height, width, _ = sizes(images)
-    colours = ops.transpose(images, np.array([0, 3, 1, 2]))  # of bytes: quicker than of floats
+    colours = ops.transpose(images, np.array([0, 3, 1, 2]))  # on bytes: faster than on floats
     red, green, blue = (
         ops.convert(part_of(ops, colours, 1, number, number + 1), np.float32) for number in range(3)
     )
@@ -90,7 +92,7 @@ def texture_graph(ops: Any, images: Any) -> tuple[Any, Any]:
 
 def _band_means(ops: Any, planes: Any) -> Any:
     """Means (B, N, bands, columns) of planes (B, N, H, W)."""
-    # Not by a pool, which lays planes out in blocks of 16 first.
+    # Not by a pool, which first reorders planes in blocks of 16.
     count, height, width = sizes(planes)
     bands = CELL_ROWS * BANDS
     rows = _row_means(ops, planes, height // bands)
@@ -99,14 +101,14 @@ def _band_means(ops: Any, planes: Any) -> Any:
 
 
 def _row_means(ops: Any, planes: Any, rows: int) -> Any:
-    """Means (B, N, H / rows, W) of each so many rows of planes (B, N, H, W)."""
+    """Means (B, N, H / rows, W) over groups of `rows` rows of planes (B, N, H, W)."""
     count, height, width = sizes(planes)
     shape = np.array([-1, count, height // rows, rows, width])
     return ops.reduce_mean(ops.reshape(planes, shape, special_zero=False), np.array([3]))
 
 
 def _flat(ops: Any, planes: list[Any]) -> Any:
-    """One row an image: the colours, and the square roots of the differences."""
+    """One row per image: the colours, then the square roots of the differences."""
     colours, *others = planes
     roots = [ops.sqrt(ops.add(plane, np.float32(SQRT_EPSILON))) for plane in others]
     together = ops.concat([colours, *roots], 1)

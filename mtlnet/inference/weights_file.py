@@ -1,8 +1,7 @@
-"""Weights as numpy arrays from a safetensors file, without torch or the package of that format.
+"""Reads weights from a safetensors file as numpy arrays, without torch or the safetensors package.
 
-The file: the header's length (8 bytes, little-endian), the header in JSON (for each tensor its
-type, its shape, and where its numbers begin and end), the numbers. Source: the format's own page,
-huggingface.co/docs/safetensors.
+Layout of the file: length of the header (8 bytes, little-endian), header in JSON (type, shape,
+begin and end of each tensor), data. Source: huggingface.co/docs/safetensors.
 """
 
 import json
@@ -23,7 +22,7 @@ LENGTH = struct.Struct("<Q")
 
 
 def read_weights(path: Path) -> dict[str, NDArray[np.float32]]:
-    """The tensors of a file by name, in float32; ModelError when it is damaged."""
+    """The tensors of a file by name, in float32. Raises ModelError when the file is damaged."""
     content = path.read_bytes()
     try:
         (length,) = LENGTH.unpack_from(content)
@@ -34,7 +33,7 @@ def read_weights(path: Path) -> dict[str, NDArray[np.float32]]:
         header.pop("__metadata__", None)
         return {name: _tensor(content, start, **about) for name, about in header.items()}
     except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ModelError(f"{path} is no whole file of weights ({error}); restore it") from error
+        raise ModelError(f"{path} is not a complete weights file ({error}); restore it") from error
 
 
 def _tensor(

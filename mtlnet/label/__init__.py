@@ -1,1 +1,1 @@
-"""Labelling pictures by hand: `mtlnet label FOLDER`."""
+"""Labelling pictures by hand in the browser: `mtlnet label FOLDER`."""

@@ -1,7 +1,7 @@
-"""The folder that is being labelled: its pictures, their cameras, and the rows of `labels.csv`.
+"""The folder being labelled: its pictures, their cameras, and the rows of `labels.csv`.
 
-Each change rewrites `labels.csv` in one step, from the file as it is then: rows of other pictures
-and columns that the page does not show stay. Only files within the folder are read.
+Each change rewrites `labels.csv` atomically, starting from the current file: rows of other pictures
+and columns that the page does not show are kept. Only files inside the folder are read.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from mtlnet.data.labels_file import (
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import CAMERA_FILE, TOLERANCE, read_camera
 from mtlnet.label.geometry import Markings
-from mtlnet.predict.kinds import Kind, kind_of
+from mtlnet.sources.kinds import Kind, kind_of
 from runtime.camera_file import write_camera
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
@@ -31,15 +31,16 @@ from trackfeatures.definitions import BEND_CURVATURE
 from trackfeatures.errors import UserError
 
 KEPT = ("drive", "light", "camera", "std_m", "std_rad")
-"""Columns of a row that saving a label does not change, unless the page gives them."""
+"""Columns that saving a label keeps, unless the page gives them."""
 
 
 class LabelFolder:
-    """Pictures are addressed by their number in `files`, the order at the start."""
+    """A folder with pictures. They are addressed by their number in `files`, whose order is
+    fixed."""
 
     def __init__(self, folder: Path, camera_file: Path | None, model: CameraParameters) -> None:
-        """`camera_file`: of pictures without a camera of their own; it is copied into the folder
-        where that has none. `model`: what a camera's file leaves out. Raises UserError."""
+        """`camera_file`: the camera of pictures without their own; copied into the folder if it has
+        none. `model`: values missing in a camera file. Raises UserError."""
         if not folder.is_dir():
             raise UserError(f"there is no folder {folder}; give one with pictures")
         self.folder = folder.resolve()
@@ -48,14 +49,14 @@ class LabelFolder:
         self.files = self._find()
         if not self.files:
             raise UserError(f"there is no picture in {folder}")
-        self.rows()  # raises for a faulty file before the first label is drawn
+        self.rows()  # raises for a faulty file before labelling starts
         own = self.folder / CAMERA_FILE
         if camera_file is not None:
             camera = read_camera(camera_file, model)
             if own.exists() and read_camera(own, model) != camera:
                 raise UserError(
                     f"{own} describes another camera than {camera_file}; leave --camera out, or "
-                    "delete the former"
+                    f"delete {own}"
                 )
             if not own.exists():
                 write_camera(own, camera, f"From {camera_file.name}, by `mtlnet label`.")
@@ -63,7 +64,7 @@ class LabelFolder:
         named = len(self.rows()) == len(self.files) and not missing
         if not own.exists() and not named:
             raise UserError(
-                f"{folder} has no {CAMERA_FILE}, without which no metres follow from a picture: "
+                f"{folder} has no {CAMERA_FILE}, which is needed to compute metres: "
                 "give --camera FILE (`mtlnet calibrate` makes one)"
             )
 
@@ -79,7 +80,7 @@ class LabelFolder:
         return sorted(found, key=natural_key)
 
     def rows(self) -> dict[str, Cells]:
-        """The rows of `labels.csv` by file; none where there is no such file."""
+        """Rows of `labels.csv` by file; empty if there is no such file."""
         path = self.folder / LABELS
         if not path.is_file():
             return {}
@@ -93,7 +94,7 @@ class LabelFolder:
         return read_whole_image(path)
 
     def camera(self, number: int, width: int, height: int) -> CameraParameters:
-        """The camera of a picture, at the picture's size. Raises UserError."""
+        """Camera of a picture, at the picture's size. Raises UserError."""
         row = self.rows().get(self.files[number], {})
         name = row.get("camera") or CAMERA_FILE
         path = self.folder / name
@@ -110,7 +111,7 @@ class LabelFolder:
         return camera.resized(width, height)
 
     def markings(self, number: int, camera: CameraParameters) -> Markings | None:
-        """The label of a picture; None where it has none, or none of a lane."""
+        """Label of a picture; None if it has none, or one without a lane."""
         row = self.rows().get(self.files[number])
         sides = None if row is None else _sides(row)
         if row is None or sides is None:
@@ -119,10 +120,10 @@ class LabelFolder:
         return Markings(*sides, float(row["angle"]), curvature, camera.pitch_deg)
 
     def save(self, number: int, markings: Markings, heading: str, texts: Cells) -> Cells:
-        """Write the label of a picture; returns its row. `texts`: `drive` and `light`, where given.
+        """Write the label of a picture; returns its row. `texts`: `drive` and `light`, if given.
 
-        `heading` empty: from the curvature, which holds as far as the markings were drawn: over the
-        20 m that the class looks ahead. Raises UserError for a label out of range.
+        `heading` empty: derived from the curvature, if the markings were drawn far enough (the
+        class looks 20 m ahead). Raises UserError for a label out of range.
         """
         if not heading:
             bend = "left" if markings.curvature > 0 else "right"
@@ -146,7 +147,7 @@ class LabelFolder:
         return row
 
     def remove(self, number: int) -> None:
-        """Take the label of a picture away, where it has one."""
+        """Remove the label of a picture, if it has one."""
         with self._lock:
             rows = self.rows()
             if rows.pop(self.files[number], None) is not None:
@@ -160,7 +161,7 @@ class LabelFolder:
 
 
 def _sides(row: Cells) -> tuple[float, float] | None:
-    """`ml` and `mr` of a row, or where the car is too near to a marking, of that and the next."""
+    """`ml` and `mr` of a row; where the car is too near to a marking, that marking and the next."""
     for left, right in (("ml", "mr"), ("m", "r"), ("l", "m")):
         cells = row[left], row[right]
         if all(cell and cell != UNKNOWN for cell in cells):

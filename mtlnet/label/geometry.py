@@ -1,7 +1,7 @@
-"""From the two markings of a lane, as points of a picture, to metres, heading and curvature.
+"""Metres, angle and curvature from the two markings of a lane, given as points of a picture.
 
-Road flat, markings parallel: in the track frame at the car a marking `d` m to the right lies at
-left = curvature * along^2 / 2 - d. Pixels: u right, v down, of the whole picture.
+Flat road, parallel markings: in the track frame at the car, a marking `d` m to the right lies at
+left = curvature * along^2 / 2 - d. Pixels of the whole picture: u right, v down.
 """
 
 from dataclasses import dataclass, replace
@@ -17,26 +17,26 @@ from trackfeatures.lens import mount_rotation
 
 MAX_STEPS = 40
 CONVERGED = 1e-10
-DIFFERENCE = 1e-6  # of the numerical derivatives
+DIFFERENCE = 1e-6  # step of the numerical derivatives
 MAX_PITCH_DEG = 30.0
 PITCHES_DEG = np.concatenate([[0.0], np.linspace(-4.0, 4.0, 33)])
-"""Where the search for the pitch begins, about where straight markings would meet."""
+"""Starting points of the search for the pitch, degrees, around the pitch at which straight markings
+would meet."""
 LINE_ALONG_M = np.geomspace(1.5, 80.0, 80)
 FAR_HANDLE_M = 25.0
 MARGIN = 0.03
-"""Share of the picture's sides that handles keep from its edges."""
-
-Numbers = NDArray[np.float64]
+"""Distance of handles from the edges of the picture, as a share of its sides."""
 
 
 class MarkingsError(UserError):
-    """Points that are no two parallel markings on a flat road."""
+    """The points do not lie on two parallel markings on a flat road."""
 
 
 @dataclass(frozen=True)
 class Markings:
-    """The lane's markings at the car: m, negative on the left; rad, positive where the car points
-    to the right; 1/m, left positive; the camera's pitch in this picture, positive downwards."""
+    """The lane's markings at the car, m, negative to the left; angle, rad, positive where the car
+    points to the right; curvature, 1/m, positive to the left; pitch of the camera in this picture,
+    positive downwards."""
 
     ml: float
     mr: float
@@ -52,11 +52,11 @@ def fit_markings(
     curvature: float | None = 0.0,
     pitch_deg: float | None = None,
 ) -> Markings:
-    """The markings through points (N, 2) of each, in px of the camera's pictures.
+    """The markings through points (N, 2) of each, px of the camera's pictures.
 
-    `curvature` None: it is found, too, from a third point of either; `pitch_deg` None: so is the
-    pitch, from where the markings would meet. Least squares of the points' distances across, in
-    pixels. Raises MarkingsError.
+    `curvature` None: it is fitted too, from a third point on either marking; `pitch_deg` None: so
+    is the pitch, from where the markings would meet. Least squares of the points' lateral
+    distances, converted to px. Raises MarkingsError.
     """
     points = [np.asarray(side, np.float64).reshape(-1, 2) for side in (left, right)]
     if min(map(len, points)) < 2:
@@ -70,7 +70,7 @@ def fit_markings(
     else:
         pitches = [pitch_deg]
     starts = [np.array([-1.8, 1.8, 0.0, curvature or 0.0, pitch]) for pitch in pitches]
-    # At one pitch the others follow almost linearly: so the search begins at the best pitch.
+    # At a fixed pitch the other values are almost linear, so the search starts at the best pitch.
     inner = free & [True, True, True, True, False]
     found = [_refine(camera, pixels, sides, start, inner, steps=3) for start in starts]
     best = min(found, key=lambda each: each[0])
@@ -79,22 +79,22 @@ def fit_markings(
         raise MarkingsError("a point lies at or above the horizon; drag it down onto the road")
     ml, mr, angle, bend, pitch = values.tolist()
     if abs(angle) > 1 or abs(pitch) > MAX_PITCH_DEG or abs(bend) > 0.2:
-        raise MarkingsError("these points are no two parallel markings of a road ahead")
+        raise MarkingsError("these points do not lie on two parallel markings of a road ahead")
     return Markings(ml, mr, angle, bend, pitch)
 
 
 def _refine(
     camera: CameraParameters,
-    pixels: Numbers,
+    pixels: NDArray[np.float64],
     sides: NDArray[np.int64],
-    values: Numbers,
+    values: NDArray[np.float64],
     free: NDArray[np.bool_],
     steps: int,
-) -> tuple[float, Numbers]:
-    """Sum of squares, px^2, and the values (5,) of which the `free` ones lower it.
+) -> tuple[float, NDArray[np.float64]]:
+    """Sum of squares, px^2, and the values (5,) after fitting the `free` ones.
 
-    By Levenberg's and Marquardt's method; the sum is infinite where a point is no point of the
-    road, and stays so from a start like this.
+    By the method of Levenberg and Marquardt. The sum is infinite where a point is not on the road,
+    and stays so from such a start.
     """
     names = np.flatnonzero(free)
     residual = _residuals(camera, pixels, sides, values)
@@ -127,9 +127,13 @@ def _refine(
 
 
 def _residuals(
-    camera: CameraParameters, pixels: Numbers, sides: NDArray[np.int64], values: Numbers
-) -> Numbers:
-    """How far (N,) points lie from their marking, across, in px; infinite above the horizon."""
+    camera: CameraParameters,
+    pixels: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    values: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Lateral distances (N,) of points from their marking, converted to px; infinite above the
+    horizon."""
     ml, mr, angle, curvature, pitch = values.tolist()
     x, y = replace(camera, pitch_deg=pitch).road_points(pixels).T
     along = x * np.cos(angle) + y * np.sin(angle)
@@ -140,11 +144,13 @@ def _residuals(
     return np.where(np.isfinite(pixels_away), pixels_away, np.inf)
 
 
-def _meeting_pitch(camera: CameraParameters, left: Numbers, right: Numbers) -> float:
+def _meeting_pitch(
+    camera: CameraParameters, left: NDArray[np.float64], right: NDArray[np.float64]
+) -> float:
     """The pitch, degrees, at which the straight lines through both markings are level.
 
-    Each marking and the eye span a plane; both planes hold the road's direction (Hartley and
-    Zisserman 2004, section 8.6).
+    Each marking and the optical centre span a plane; both planes contain the road's direction
+    (Hartley and Zisserman 2004, section 8.6).
     """
     normals = []
     for side in (left, right):
@@ -167,7 +173,7 @@ def _meeting_pitch(camera: CameraParameters, left: Numbers, right: Numbers) -> f
 
 def marking_pixels(
     camera: CameraParameters, markings: Markings, along: ArrayLike = LINE_ALONG_M
-) -> tuple[Numbers, Numbers]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixels (N, 2) of the left and the right marking, NaN where the camera does not see them."""
     source = replace(camera, pitch_deg=markings.pitch_deg)
     found = []
@@ -179,9 +185,9 @@ def marking_pixels(
 
 
 def handles(camera: CameraParameters, markings: Markings) -> dict[str, list[list[float]]]:
-    """Of each side, by name, the pixels of its near, its middle and its far handle.
+    """By side: the pixels of the near, the middle and the far handle.
 
-    Where a marking is not in the picture, its handles lie at the picture's edge.
+    Where a marking leaves the picture, its handles lie at the picture's edge.
     """
     size = np.array([camera.width - 1, camera.height - 1], np.float64)
     found = {}

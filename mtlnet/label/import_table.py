@@ -1,11 +1,11 @@
-"""Converts a table of lane labels in the picture's own terms into a folder with a `labels.csv`:
-`mtlnet label FOLDER --import FILE`.
+"""Converts a table of lane labels, measured at the camera, to a folder with a `labels.csv`: `mtlnet
+label FOLDER --import FILE`.
 
-Columns that are read: `file` (beside the table); `x_left_m`, `x_right_m`, where the lane's markings
-lie at the camera, left positive; `heading_rad`, of the camera against the road, positive to the
-right; `fov_y_deg` and `camera_height_m` of the camera; perhaps `focal_px` and `horizon_y_px`, which
-give the pitch, `curvature_1pm`, left positive, `drive` and `light`. Others are left out. The
-cameras are pinholes, and metres are measured at the camera.
+Columns: `file`, relative to the table; `x_left_m`, `x_right_m`, positions of the lane's markings at
+the camera, positive to the left; `heading_rad`, angle of the camera to the road, positive to the
+right; `fov_y_deg` and `camera_height_m` of the camera. Optional: `focal_px` and `horizon_y_px`,
+which give the pitch, `curvature_1pm`, positive to the left, `drive` and `light`. Other columns are
+ignored. The cameras are pinholes.
 """
 
 import csv
@@ -38,7 +38,7 @@ CAMERAS = "cameras"
 
 @dataclass(frozen=True)
 class LabelStd:
-    """Standard deviations of the labels of files that match `pattern`."""
+    """Standard deviations of the labels of the files that match `pattern`."""
 
     pattern: str
     metres: float
@@ -46,7 +46,7 @@ class LabelStd:
 
 
 def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
-    """Of `--label-std 0.06,0.006 --label-std 'night_*=0.16,0.012'`. Raises UserError."""
+    """The values of `--label-std 0.06,0.006 --label-std 'night_*=0.16,0.012'`. Raises UserError."""
     found = []
     for text in texts:
         pattern, _, numbers = text.rpartition("=")
@@ -62,10 +62,10 @@ def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
 
 
 def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> dict[str, Any]:
-    """Copy the pictures of a table to `folder`, with `labels.csv` and their cameras' files.
+    """Copy the pictures of a table to `folder`, with `labels.csv` and camera files.
 
-    Of `stds` the last one that matches a file holds. Returns `folder`, `pictures` and `cameras`.
-    Raises UserError for a faulty row, and where `folder` has labels already.
+    The last of `stds` that matches a file is used. Returns `folder`, `pictures` and `cameras`.
+    Raises UserError for a faulty row, and if `folder` has labels already.
     """
     if (folder / LABELS).exists():
         raise UserError(f"{folder / LABELS} exists; give a new folder")
@@ -106,9 +106,9 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
 def _converted(
     folder: Path, row: dict[str, str], stds: Sequence[LabelStd]
 ) -> tuple[CameraParameters, Cells]:
-    """The camera, level, and the cells of a row. Raises UserError or ValueError."""
+    """The level camera and the cells of a row. Raises UserError or ValueError."""
     if not path_within(row["file"]):
-        raise UserError(f"the file {row['file']!r} is no path beside the table")
+        raise UserError(f"the file {row['file']!r} is not a path inside the table's folder")
     height, width = read_whole_image(folder / row["file"]).shape[:2]
     camera = CameraParameters(
         width=width,
@@ -123,7 +123,7 @@ def _converted(
         "file": row["file"],
         **lane_cells(-_number(row, "x_left_m"), -_number(row, "x_right_m")),
         "angle": f"{_number(row, 'heading_rad'):.6g}",
-        # A gentler bend may be the beginning of one: the class looks 20 m ahead.
+        # A gentler bend may become sharper: the class looks 20 m ahead.
         "heading": bend if abs(curvature) >= BEND_CURVATURE else UNKNOWN,
         "drive": row.get("drive") or "",
         "light": row.get("light") or "",
@@ -149,7 +149,7 @@ def _number(row: dict[str, str], name: str) -> float:
 
 
 def _write_camera(folder: Path, camera: CameraParameters, taken: set[str]) -> str:
-    """Write the file of a camera; its name within `folder`."""
+    """Write the file of a camera; returns its name within `folder`."""
     base = f"{CAMERAS}/{camera.width}x{camera.height}-{camera.fov_y_deg:g}deg"
     name, number = f"{base}.yaml", 2
     while name in taken:  # another height

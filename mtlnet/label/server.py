@@ -1,8 +1,8 @@
 """The page of `mtlnet label FOLDER` and its JSON interface, on one local port.
 
-Pictures are addressed by number: a request names no file. Every request is checked as the service
-checks its own (`runtime.access`): Host, Origin, and the token where there is one. The page itself
-holds no data and needs no token.
+Pictures are addressed by number, so that a request names no file. Every request is checked as in
+the service (`runtime.access`): Host, Origin, and the token if there is one. The page itself
+contains no data and needs no token.
 """
 
 import sys
@@ -30,7 +30,7 @@ from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
 from runtime.access import HostNames
-from runtime.files import locked_folder
+from runtime.files import locked_folder, name_as_text
 from runtime.sockets import address, bind_all
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -47,9 +47,10 @@ HEADERS = {
 }
 MAX_BODY_BYTES = 64 << 10
 MAX_SHOWN_PX = 1600
-"""Longer side of a picture as it is sent to the page."""
+"""Maximum of the longer side of a picture sent to the page, px."""
 USUAL_LANE = -1.8, 1.8, 0.0, 0.0
-"""Where the lines begin without an answer of the model: in the middle of a lane of 3.6 m."""
+"""Initial markings without an answer of the model: those of a lane of 3.6 m with the car in its
+middle."""
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -69,13 +70,13 @@ class Drag(BaseModel):
     left: Pixels
     right: Pixels
     curvature: Number | None = 0.0
-    """1/m; None: found from a third point."""
+    """Curvature, 1/m; None: fitted from a third point."""
     pitch_deg: Number | None = None
-    """None: found from where the markings meet."""
+    """Pitch, degrees; None: fitted from where the markings meet."""
 
 
 class Label(BaseModel):
-    """What is saved for a picture."""
+    """The label to save for a picture."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -90,10 +91,10 @@ class Label(BaseModel):
 
 
 class Labeller:
-    """Answers of a model and labels by hand, of the pictures of a folder."""
+    """Answers of a model and labels made by hand, for the pictures of a folder."""
 
     def __init__(self, folder: LabelFolder, engine: Engine | None) -> None:
-        """`engine` None: without answers of a model."""
+        """`engine` None: there are no answers of a model."""
         self.folder = folder
         self._engine = engine
         self._lock = Lock()  # an engine takes one picture at a time
@@ -101,11 +102,14 @@ class Labeller:
     def listing(self) -> dict[str, Any]:
         """The pictures by number: name, and whether they are labelled."""
         rows = self.folder.rows()
-        files = [{"file": _text(name), "labelled": name in rows} for name in self.folder.files]
-        return {"folder": _text(self.folder.folder.name), "pictures": files}
+        files = [
+            {"file": name_as_text(name), "labelled": name in rows} for name in self.folder.files
+        ]
+        return {"folder": name_as_text(self.folder.folder.name), "pictures": files}
 
     def picture(self, number: int) -> dict[str, Any]:
-        """Size, row, lines and handles of a picture: of its label, else of the model's answer."""
+        """Size, row, lines and handles of a picture, from its label or else from the model's
+        answer."""
         image = self.folder.picture(number)
         height, width = image.shape[:2]
         camera = self.folder.camera(number, width, height)
@@ -114,11 +118,11 @@ class Labeller:
         answer, note = (None, "") if label else self._answer(image, camera)
         usual = Markings(*USUAL_LANE, camera.pitch_deg)
         return {
-            "file": _text(self.folder.files[number]),
+            "file": name_as_text(self.folder.files[number]),
             "width": width,
             "height": height,
             "camera_pitch_deg": camera.pitch_deg,
-            "row": None if row is None else {k: _text(v) for k, v in row.items()},
+            "row": None if row is None else {k: name_as_text(v) for k, v in row.items()},
             "source": "label" if label else "model" if answer else "usual",
             "note": note,
             **shown(camera, label or answer or usual),
@@ -127,7 +131,7 @@ class Labeller:
     def _answer(
         self, image: np.ndarray[Any, Any], camera: CameraParameters
     ) -> tuple[Markings | None, str]:
-        """The model's answer, and a note on it."""
+        """The model's answer, and a note about it."""
         if self._engine is None:
             return None, ""
         lens = Rectification(camera, self._engine.card.camera)
@@ -162,7 +166,7 @@ class Labeller:
 
 
 def _lane(found: Prediction) -> tuple[float, float] | None:
-    """`ml` and `mr` of an answer, or where the car is on a marking, that one and the next."""
+    """`ml` and `mr` of an answer; where the car is on a marking, that marking and the next."""
     metres = found.distances_m
     for left, right in (("ml", "mr"), ("m", "r"), ("l", "m")):
         pair = metres[left], metres[right]
@@ -171,13 +175,8 @@ def _lane(found: Prediction) -> tuple[float, float] | None:
     return None
 
 
-def _text(name: str) -> str:
-    """A file's name as text: bytes that are not UTF-8 as escapes."""
-    return name.encode("utf-8", "backslashreplace").decode()
-
-
 def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:
-    """Markings as JSON: their numbers, and lines and handles in px of the picture."""
+    """Markings as JSON: their values, and lines and handles in px of the picture."""
     lines = {}
     for side, pixels in zip(("left", "right"), marking_pixels(camera, markings), strict=True):
         seen = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e5).all(1)]
@@ -193,7 +192,7 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
 
     @app.exception_handler(UserError)
     async def refuse(_request: Any, error: UserError) -> Response:
-        # The page knows its files without the folder's place on this machine.
+        # The page names its files without the folder's path on this machine.
         told = str(error).replace(f"{labeller.folder.folder}/", "")
         return JSONResponse({"detail": told}, 422, HEADERS)
 
@@ -220,7 +219,7 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
         texts = {"drive": label.drive, "light": label.light}
         given = {name: text.strip() for name, text in texts.items() if text is not None}
         row = labeller.folder.save(number, markings, label.heading, given)
-        return JSONResponse({k: _text(v) for k, v in row.items()}, headers=HEADERS)
+        return JSONResponse({k: name_as_text(v) for k, v in row.items()}, headers=HEADERS)
 
     def delete_label(number: int) -> Response:
         labeller.folder.remove(number)
@@ -257,7 +256,7 @@ def _checked(app: Asgi, names: HostNames, token: str | None) -> Asgi:
                 await refusal(scope, receive, send)
                 return
         elif scope["type"] != "lifespan":
-            return  # no WebSocket here: uvicorn answers 403
+            return  # there is no WebSocket: uvicorn answers 403
         await app(scope, receive, send)
 
     return run
@@ -270,7 +269,7 @@ def _refusal(scope: Scope, names: HostNames, token: str | None) -> Response | No
     if count != 1:
         return _refused(400, "send one Host header")
     if not names.allow_host(host):
-        return _refused(421, "this name is none of this page's; use its address, or a token")
+        return _refused(421, "this host name is not one of this page; use its address, or a token")
     if origin is not None and not names.allow_origin(origin, host):
         return _refused(403, "a page of another site may not use this one")
     if token is not None and scope["path"].startswith("/api/"):
@@ -291,7 +290,7 @@ def _refused(status: int, detail: str) -> Response:
 
 
 def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) -> None:
-    """Serve the page until Ctrl-C. Raises UserError where the address cannot be listened on."""
+    """Serve the page until Ctrl-C. Raises UserError when the address is not available."""
     names = HostNames([host], any_name=token is not None)
     app = create_app(labeller, names, token)
     with locked_folder(labeller.folder.folder):

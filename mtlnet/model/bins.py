@@ -1,12 +1,13 @@
-"""Distances and angle as distributions over bins: targets, and the answer read from the scores.
+"""Distances and angle as distributions over bins: targets, and the answer computed from scores.
 
-A distance is a softmax over `PLACES` bins of its range (`trackfeatures.RANGES`) and one class
-"absent"; the angle one over `ANGLES` bins. A number's target is a normal distribution about it,
-integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al. 2024). The answer is
-the expectation within `NEAR` bins of the likeliest one: where a marking's distance jumps to the
-next marking's, a regression answers in between, two peaks do not.
+A distance is a softmax over `DISTANCE_BINS` bins of its range (`trackfeatures.RANGES`) and a class
+"absent"; the angle is a softmax over `ANGLE_BINS` bins. The target of a value is a normal
+distribution around it, integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al.
+2024). The answer is the expectation over the bins within `NEAR` of the likeliest bin. Where a
+marking's distance jumps to that of the next marking, a regression would answer with a value in
+between; a distribution has two peaks, and one of them is chosen.
 
-All in torch operations without branches, so that a network ends with them when it is exported.
+Torch operations without branches, so that they can be part of an exported network.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import log_softmax
 
 import trackfeatures as tf
-from mtlnet.model.architecture import ABSENT_ABOVE, ANGLES, BIN_VARIANCE, NEAR, PAIR, PLACES
+from mtlnet.architecture import ABSENT_ABOVE, ANGLE_BINS, BIN_VARIANCE, DISTANCE_BINS, NEAR, PAIR
 from trackfeatures.coding import OFFSET, SPAN
 
 SPREAD = 1.0
@@ -29,28 +30,28 @@ _SPANS = [tf.RANGES[name] for name in tf.TARGETS]
 
 @dataclass(frozen=True)
 class Scores:
-    """What the heads say of B images, before softmax."""
+    """The outputs of the heads for B images, before softmax."""
 
-    distance: Tensor  # (B, 5, PLACES + 1), the last "absent"
-    angle: Tensor  # (B, ANGLES)
+    distance: Tensor  # (B, 5, DISTANCE_BINS + 1), the last "absent"
+    angle: Tensor  # (B, ANGLE_BINS)
     heading: Tensor  # (B, 3)
 
 
 def split_scores(distance: Tensor, angle: Tensor, heading: Tensor) -> Scores:
-    """Scores of the heads' rows (B, `DISTANCE_SCORES`), (B, `ANGLES`) and (B, 3)."""
-    return Scores(distance.reshape(-1, len(tf.MARKINGS), PLACES + 1), angle, heading)
+    """Scores from the heads' outputs (B, 5 * (DISTANCE_BINS + 1)), (B, ANGLE_BINS) and (B, 3)."""
+    return Scores(distance.reshape(-1, len(tf.MARKINGS), DISTANCE_BINS + 1), angle, heading)
 
 
 def bin_centres(low: float, high: float, count: int) -> list[float]:
-    """The middles of `count` bins between two values."""
+    """The centres of `count` equal bins between `low` and `high`."""
     width = (high - low) / count
     return [low + width * (k + 0.5) for k in range(count)]
 
 
 def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tensor:
-    """Probabilities (..., `count`) of bins between `low` and `high` for values (...).
+    """Target probabilities (..., `count`) of equal bins between `low` and `high` for values (...).
 
-    A value outside counts as the nearer end; what of a distribution lies beyond is cut off.
+    Values are clipped to the range; the distribution is truncated to it.
     """
     width = (high - low) / count
     edges = torch.linspace(low, high, count + 1, dtype=values.dtype, device=values.device)
@@ -61,22 +62,25 @@ def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tenso
 
 
 def bin_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
-    """Target distributions (B, 5, PLACES + 1) and (B, ANGLES) of coded targets (B, 6)."""
+    """Target distributions of coded targets (B, 6): (B, 5, DISTANCE_BINS + 1), (B, ANGLE_BINS)."""
     values = _decoded(coded)
     absent = absent_in(coded)
     each = []
     for column in range(len(tf.MARKINGS)):
         span = _SPANS[column]
-        places = normal_targets(values[:, column], span.lo, span.hi, PLACES)
+        places = normal_targets(values[:, column], span.lo, span.hi, DISTANCE_BINS)
         here = ~absent[:, column : column + 1]
         each.append(torch.cat([places * here, (~here).to(places)], 1))
-    angle = normal_targets(values[:, -1], _SPANS[-1].lo, _SPANS[-1].hi, ANGLES)
+    angle = normal_targets(values[:, -1], _SPANS[-1].lo, _SPANS[-1].hi, ANGLE_BINS)
     return torch.stack(each, 1), angle
 
 
 def absent_in(coded: Tensor) -> Tensor:
-    """Which distances coded targets (B, 6) call absent: (B, 5) bool. A label says so by the
-    range's inactive end, which no marking that is there reaches."""
+    """Whether each distance of coded targets (B, 6) is absent: (B, 5) bool.
+
+    A label codes an absent marking as the inactive end of its range; a marking that is present
+    never reaches that value.
+    """
     ends = [span.inactive for span in _SPANS[:-1]]
     there = _numbers(ends, coded)
     low, width = _ranges(coded)
@@ -84,17 +88,18 @@ def absent_in(coded: Tensor) -> Tensor:
 
 
 _SAME = 1e-4
-"""Of a coded value: float32's own error is a thousandth of this, the nearest marking 0.02 away."""
+"""Coded values that differ by less are equal. The rounding error of float32 is a thousandth of it;
+the nearest code of a present marking is 0.02 away."""
 
 
 def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
-    """Coded answers (B, 6) of scores (B, 5, PLACES + 1) and (B, ANGLES).
+    """Coded answers (B, 6) of scores (B, 5, DISTANCE_BINS + 1) and (B, ANGLE_BINS).
 
-    A distance is absent where that is more probable than `ABSENT_ABOVE`; it is coded as the
-    inactive end of its range, as in a label.
+    A distance whose probability of absence exceeds `ABSENT_ABOVE` is coded as the inactive end of
+    its range, as in a label.
     """
     absent = absent_probabilities(distance)
-    found = expectation(distance[:, :, :-1])  # in bins' places, [0, 1] of the range
+    found = expectation(distance[:, :, :-1])  # in [0, 1] of the range
     ends = _numbers([0.0 if span.inactive == span.lo else 1.0 for span in _SPANS[:-1]], found)
     limits = _numbers(ABSENT_ABOVE, absent)
     shares = torch.where(absent > limits, ends.expand_as(found), found)
@@ -103,9 +108,9 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
 
 
 def absent_probabilities(distance: Tensor) -> Tensor:
-    """Probabilities (B, 5) that markings are absent, of scores (B, 5, PLACES + 1).
+    """Probabilities (B, 5) that each marking is absent, from scores (B, 5, DISTANCE_BINS + 1).
 
-    `ml` and `mr` are absent together: both have the mean of their two probabilities.
+    `ml` and `mr` are always absent together, so both get the mean of their probabilities.
     """
     absent = torch.softmax(distance, 2)[:, :, -1]
     pair = absent[:, PAIR].mean(1, keepdim=True).expand(-1, 2)
@@ -113,7 +118,10 @@ def absent_probabilities(distance: Tensor) -> Tensor:
 
 
 def expectation(scores: Tensor) -> Tensor:
-    """Where in its range, as a share in [0, 1], a number lies by its bins' scores (..., count)."""
+    """Expected position in the range, in [0, 1], from the scores (..., count) of its bins.
+
+    Only the bins within `NEAR` of the likeliest one count.
+    """
     count = scores.shape[-1]
     number = torch.arange(count, dtype=torch.float32, device=scores.device)
     best = scores.argmax(-1, keepdim=True).to(torch.float32)
@@ -123,9 +131,9 @@ def expectation(scores: Tensor) -> Tensor:
 
 
 def log_spreads(distance: Tensor, angle: Tensor) -> Tensor:
-    """Logarithms (B, 6) of the standard deviations, in bins, of the distributions of such scores.
+    """Logarithms (B, 6) of the standard deviations, in bins, of the distributions of the scores.
 
-    Over all bins but "absent", so that two separate peaks count as a wide distribution.
+    Over all bins except "absent", so that two separate peaks count as a wide distribution.
     """
     spreads = [_log_spread(distance[:, :, :-1]), _log_spread(angle)[:, None]]
     return torch.cat(spreads, 1)
@@ -151,8 +159,9 @@ def _ranges(like: Tensor) -> tuple[Tensor, Tensor]:
 def _numbers(values: Sequence[float | None], like: Tensor) -> Tensor:
     """Constants as a tensor of the type and on the device of `like`.
 
-    On a GPU it is kept: while a CUDA graph is recorded, nothing may be copied from the host's
-    memory. On a CPU it is new, since an export traces this code with tensors that hold no values.
+    On a GPU the tensor is cached, because nothing may be copied from the host's memory while a CUDA
+    graph is recorded. On a CPU it is created anew, because an export traces this code with tensors
+    that hold no values.
     """
     if like.is_cuda:
         return _kept_numbers(tuple(values), like.dtype, like.device)

@@ -1,10 +1,9 @@
-"""The multi-task network of the paper (section IV-C), and the others of
-`mtlnet.model.architecture`.
+"""The multi-task network of the paper (section IV-C) and the others of `mtlnet.architecture`.
 
 Input: uint8 RGB images (B, 210, 280, 3). Output (B, 9): five coded distances and the coded angle
-(linear), and scores of the classes left, straight, right (before the softmax). Recipe `fast` trains
-a reparametrised form, with batch normalisation after every convolution and standardised regression
-targets; `fold` converts it to the paper's network, exactly.
+(linear), then scores of the classes left, straight, right (before the softmax). Recipe `fast`
+trains a reparametrised form with batch normalisation after every convolution and standardised
+regression targets; `fold` converts it exactly to the paper's network.
 """
 
 import copy
@@ -19,7 +18,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from mtlnet.model.architecture import (
+from mtlnet.architecture import (
     HEIGHT,
     MTL,
     WIDTH,
@@ -44,13 +43,14 @@ from runtime.files import utf8_path
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
 RUN_BATCH = 32
-"""Images that `run_network` computes at a time: their features take some MB each."""
+"""Images per batch of `run_network`; the features of one image take some MB."""
 CODED_HEADS = (("distance", slice(0, 5)), ("angle", slice(5, 6)))
-"""The heads of coded values and their columns of the outputs."""
+"""Heads of coded values and their columns in the outputs."""
 
 
 class Network(nn.Module):
-    """The network; with `batch_norm` and other `target_*`, the form that recipe `fast` trains."""
+    """The network. With `batch_norm` and non-default `target_*` it has the form that `fast`
+    trains."""
 
     target_mean: Tensor
     target_std: Tensor
@@ -68,7 +68,7 @@ class Network(nn.Module):
             size = units
         heads = {name: nn.Linear(size, units) for name, units in architecture.heads}
         self.heads = nn.ModuleDict(heads)
-        # Only in training: `fold` leaves them out.
+        # Used only in training: `fold` omits them.
         self.auxiliary = None
         if architecture.bins and architecture.keeps_places and batch_norm:
             self.auxiliary = AuxiliaryHeads(architecture, size)
@@ -77,25 +77,25 @@ class Network(nn.Module):
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (B, 210, 280, 3), uint8 or normalised float -> outputs (B, 9) float32."""
+        """Outputs (B, 9) float32 for images (B, 210, 280, 3), uint8 or normalised float."""
         return self.forward_heads(self.forward_features(images))
 
     def forward_features(self, images: Tensor) -> Tensor:
-        """The last shared features (B, 256) of images, the input of the heads."""
+        """Last shared features (B, 256) of images: the input of the heads."""
         features: Tensor = self.shared(self.forward_grid(images).flatten(1))
         return features
 
     def forward_grid(self, images: Tensor) -> Tensor:
-        """The last convolution's features (B, C, h, w) of images (B, 210, 280, 3)."""
-        # Counted from below: images may come without the rows that are not read.
+        """Features (B, C, h, w) of the last convolution for images (B, 210, 280, 3)."""
+        # Counted from the bottom: images may lack the rows at the top, which are not read.
         images = images[:, images.shape[1] - HEIGHT + self.architecture.first_row :]
         x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
         grid: Tensor = self.features(x)
         return grid
 
     def forward_heads(self, x: Tensor) -> Tensor:
-        """The outputs (B, 9) for last shared features (B, 256)."""
-        # In float32 also under autocast: coded values differ by little, and the heads are small.
+        """Outputs (B, 9) for last shared features (B, 256)."""
+        # float32 also under autocast: coded values differ little, and the heads are small.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
             if self.architecture.bins:
@@ -107,9 +107,9 @@ class Network(nn.Module):
             )
 
     def uncertainty_inputs(self, x: Tensor) -> Tensor:
-        """What the uncertainty head reads (B, `architecture.uncertainty_inputs`).
+        """Inputs of the uncertainty head (B, `architecture.uncertainty_inputs`).
 
-        The last shared features x (B, 256) and, of heads over bins, the logarithms of the spreads.
+        The last shared features x (B, 256) and, for heads over bins, the logarithms of the spreads.
         """
         if not self.architecture.bins:
             return x
@@ -117,7 +117,7 @@ class Network(nn.Module):
         return torch.cat([x.float(), log_spreads(scores.distance, scores.angle)], 1)
 
     def absent_probabilities(self, x: Tensor) -> Tensor:
-        """Probabilities (B, 5) that markings are absent; (B, 0) for heads of coded values.
+        """Probabilities (B, 5) that each marking is absent; (B, 0) for heads of coded values.
 
         `x` (B, 256): the last shared features.
         """
@@ -126,14 +126,14 @@ class Network(nn.Module):
         return absent_probabilities(self.forward_scores(x).distance)
 
     def forward_scores(self, x: Tensor) -> Scores:
-        """The scores of heads over bins for last shared features (B, 256)."""
+        """Scores of heads over bins for last shared features (B, 256)."""
         with torch.autocast(x.device.type, enabled=False):
             each = [self.heads[name](x.float()) for name, _ in self.architecture.heads]
             return split_scores(*each)
 
 
 def normalise(images: Tensor) -> Tensor:
-    """uint8 colours -> float32 in [-1, 1]; the exported graph does the same."""
+    """float32 colours in [-1, 1] from uint8 colours, as in the exported graph."""
     return images.float() * (1 / 127.5) - 1.0
 
 
@@ -144,7 +144,7 @@ def initialise(network: Network, seed: int) -> None:
         if isinstance(module, nn.Conv2d | nn.Linear):
             gain = 0.01 if name.startswith(("heads", "auxiliary")) else 2.0
             if name == "heads.heading" and "heading" not in network.architecture.tasks:
-                gain = 0.0  # not trained: equal probabilities
+                gain = 0.0  # an untrained head: equal probabilities
             fan_in = module.weight[0].numel()
             with torch.no_grad():
                 module.weight.normal_(0.0, (gain / fan_in) ** 0.5, generator=generator)
@@ -162,18 +162,18 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
 
 @dataclass(frozen=True)
 class Answers:
-    """What a network answers for B images."""
+    """The results of a network for B images."""
 
     uncertainty_inputs: NDArray[np.float32]
-    """(B, F), read by the uncertainty head."""
+    """Inputs of the uncertainty head (B, F)."""
     outputs: NDArray[np.float32]
-    """(B, 9): coded distances, coded angle and class probabilities."""
+    """Outputs (B, 9): coded distances, coded angle and class probabilities."""
     absent: NDArray[np.float32]
-    """(B, 5) probabilities that markings are absent; (B, 0) for heads of coded values."""
+    """Probabilities (B, 5) that each marking is absent; (B, 0) for heads of coded values."""
 
 
 def run_network(network: Network, images: NDArray[np.uint8]) -> Answers:
-    """The answers for images (B, 210, 280, 3), computed `RUN_BATCH` at a time."""
+    """Results for images (B, 210, 280, 3), computed in batches of `RUN_BATCH`."""
     network.eval()
     starts = range(0, max(len(images), 1), RUN_BATCH)
     parts = [_run_batch(network, torch.from_numpy(images[i : i + RUN_BATCH])) for i in starts]
@@ -198,7 +198,7 @@ def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.fl
 
 
 class SamePad(nn.Module):
-    """Zero padding that gives the next layer TensorFlow's SAME padding."""
+    """Zero padding before a layer that together is TensorFlow's SAME padding."""
 
     def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
         super().__init__()
@@ -222,7 +222,7 @@ class Residual(nn.Sequential):
 def block(
     layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0, *, skip: bool = False
 ) -> nn.Sequential:
-    """layer - [batch normalisation] - ReLU - [dropout], with `skip` a `Residual`."""
+    """layer, [batch normalisation], ReLU, [dropout]; with `skip` as a `Residual`."""
     parts: list[tuple[str, nn.Module]] = [("layer", layer)]
     if norm is not None:
         parts.append(("norm", norm))
@@ -236,7 +236,7 @@ def block(
 
 
 def build_features(architecture: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """The module before the fully connected layers, (B, 3, H, W) -> (B, ...), and its size."""
+    """Module before the fully connected layers, (B, 3, H, W) -> (B, ...), and its output size."""
     if architecture.backbone:
         return build_backbone(architecture.backbone, batch_norm=batch_norm)
     features = nn.Sequential()
@@ -273,9 +273,9 @@ def _convolution(channels: int, spec: Conv, batch_norm: bool) -> nn.Sequential:
 
 
 def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """A torchvision model without its classifier, randomly initialised, and its feature count.
+    """A torchvision model without classifier, randomly initialised, and its number of features.
 
-    Without `batch_norm`: with batch normalisation folded away.
+    Without `batch_norm` its batch normalisation is folded away.
     """
     from torchvision.models import get_model
 
@@ -285,7 +285,7 @@ def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
     setattr(model, last, nn.Identity())
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):
-            # torchvision's 0.01 is for runs of 100,000 steps; in short ones the means would lag.
+            # torchvision's 0.01 suits runs of 100,000 steps; in short runs the means would lag.
             module.momentum = NORM_MOMENTUM
     if not batch_norm:
         fold_norms(model)
@@ -296,9 +296,10 @@ def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
 
 
 def fold(network: Network) -> Network:
-    """The network without batch normalisation and target standardisation, in evaluation mode.
+    """An equivalent network without batch normalisation and target standardisation, in evaluation
+    mode.
 
-    It computes the same, and for `mtl` is the paper's network. Folded in float64.
+    For `mtl` it is the paper's network. Computed in float64.
     """
     double = copy.deepcopy(network).cpu().double()
     fold_norms(double)
@@ -315,7 +316,7 @@ def fold(network: Network) -> Network:
 
 
 def fold_norms(network: nn.Module) -> None:
-    """Fold every batch normalisation into the convolution before it; sets evaluation mode."""
+    """Fold each batch normalisation into the preceding convolution; sets evaluation mode."""
     network.eval()
     for sequence in [m for m in network.modules() if isinstance(m, nn.Sequential)]:
         for (first, conv), (second, norm) in pairwise(list(sequence.named_children())):

@@ -1,9 +1,9 @@
-"""Start a network from a finished model, whose batch normalisation was folded away.
+"""Initialise a network from a finished model, whose batch normalisation was folded away.
 
-A network trained without batch normalisation gets the model's weights. One trained with it gets
-statistics measured on images, and scales and biases that undo them, so that it computes the same.
-Its architecture may have more residual convolutions than the model; they begin near the identity
-(as in Chen et al. 2016, Net2Net).
+A network without batch normalisation gets the model's weights. A network with it gets statistics
+measured on images, and scales and biases that undo them, so that its outputs are the same. The
+network may have more residual convolutions than the model; they start near the identity (as in Chen
+et al. 2016, Net2Net).
 """
 
 from pathlib import Path
@@ -13,26 +13,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mtlnet.inference.model_card import WEIGHTS
-from mtlnet.model.architecture import HEIGHT, Architecture, Conv
+from mtlnet.architecture import HEIGHT, Architecture, Conv
 from mtlnet.model.network import CODED_HEADS, Network, load_network, normalise
 from trackfeatures.errors import UserError
 
 NEW_SCALE = 0.02
-"""Scale of the normalised outputs of a new residual convolution. At 0, none would get a gradient
-through its ReLU."""
+"""Scale of the normalised outputs of a new residual convolution. With 0 its ReLU would pass no
+gradient."""
 
 
 def load_pretrained(
-    network: Network, run: Path, images: NDArray[np.uint8] | None = None, name: str = ""
+    network: Network, weights: Path, images: NDArray[np.uint8] | None = None, name: str = ""
 ) -> None:
-    """Make `network` compute the outputs of the model of `run`, in the units of its own heads.
+    """Make `network` compute the outputs of a finished model, in the units of its own heads.
 
-    `images` (B, 210, 280, 3): measure the statistics of batch normalisation, if it has any.
-    `name`: the model's architecture, if it is another. Raises UserError when the network does not
-    contain it.
+    `weights`: the model's file. `images` (B, 210, 280, 3): the statistics of the network's batch
+    normalisation are measured on them; None for a network without it. `name`: the model's
+    architecture, if it is another. Raises UserError when the network does not contain the model.
     """
-    source = load_network(run / WEIGHTS, name or network.architecture.name)
+    source = load_network(weights, name or network.architecture.name)
     state = source.state_dict()
     mean, std = network.target_mean.cpu(), network.target_std.cpu()
     for head, rows in () if network.architecture.bins else CODED_HEADS:
@@ -55,9 +54,9 @@ def load_pretrained(
 
 
 def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
-    """Submodule names of the convolutions of `old`, and of the same ones in `new`.
+    """Submodule names of the convolutions of `old`, with those of the same convolutions in `new`.
 
-    `new` may have more residual ones. Raises UserError when it differs in anything else.
+    `new` may have more residual convolutions. Raises UserError for any other difference.
     """
     left = list(enumerate(old.features))
     names: dict[str, str] = {}
@@ -83,8 +82,9 @@ def restore_batch_norm(
 ) -> None:
     """Set the batch normalisations of a network whose filters are those of a folded model.
 
-    `biases`: those of the model's convolutions, by submodule name; others are new. The filters get
-    the size of new ones, which batch normalisation undoes: the optimizer's steps suit that size.
+    `biases`: those of the model's convolutions, by submodule name; other convolutions are new. The
+    filters are rescaled to the size of newly initialised ones, which suits the optimizer's steps;
+    batch normalisation undoes the scale.
     """
     network.eval()
     device = network.target_mean.device

@@ -1,7 +1,7 @@
-"""Which camera took the pictures of a source: the one given, else what is known of the source.
+"""Finds the camera that took the pictures of a source, for `mtlnet predict`.
 
-Here a camera is found for `mtlnet predict` where the user gives none: the one that a recording
-states, else the one that the drive itself shows (`mtlnet.calibration`).
+It is the one that the user gives, else the one that a recording states, else the one that the drive
+itself shows (`mtlnet.calibration`).
 """
 
 from dataclasses import replace
@@ -17,30 +17,31 @@ from mtlnet.calibration.lens import find_lens
 from mtlnet.calibration.mount import NotCalibrated
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.rectification import Rectification
-from mtlnet.predict.kinds import Kind
-from mtlnet.predict.pictures import Lens, Picture
-from mtlnet.predict.sources import Note, Source
+from mtlnet.sources.find import Note, Source
+from mtlnet.sources.kinds import Kind
+from mtlnet.sources.pictures import Lens, Picture
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FILM_S = 60.0
-"""Of a film, from its start, that its camera is found from."""
+"""Duration at the start of a film from which its camera is estimated, s."""
 FIRST_S, AGAIN = 15.0, 2.0
-"""A stream's camera is looked for after so long, and again after twice the time each."""
+"""The camera of a stream is estimated after this time, s, and again each time that this factor
+times the last interval has passed."""
 
 
 class _ModelsOwn(Exception):
-    """The pictures are of the size of the model's own."""
+    """The pictures have the size of the model's own camera."""
 
 
 def with_lens(
     source: Source, model: CameraParameters, given: Lens, note: Note, *, calibrate: bool = False
 ) -> Source:
-    """The source with its lens: the one given, else that of the camera that a recording states,
-    else with `calibrate` the one that a film or a stream shows.
+    """The source with its lens: `given`, else that of the camera that a recording states, else with
+    `calibrate` that of the camera that a film or a stream shows.
 
-    Of a field of view that is given `calibrate` finds the mount. `note`: takes a line on what was
-    found.
+    If a field of view is given, `calibrate` estimates the mount. `note`: called with a line about
+    what was found.
     """
     if isinstance(given, Rectification) or source.problem or source.kind is Kind.ROUND:
         return replace(source, lens=given)
@@ -56,9 +57,9 @@ def with_lens(
 
 
 def _stated(source: Source, model: CameraParameters, note: Note) -> Source | None:
-    """A recording with the camera that it states; None where it states none."""
-    from mtlnet.predict.recordings.cameras import is_models
-    from mtlnet.predict.recordings.recording import Recording
+    """The recording with the camera that it states; None if it states none."""
+    from mtlnet.sources.recordings.cameras import is_models
+    from mtlnet.sources.recordings.recording import Recording
 
     assert isinstance(source.opened, Recording)
     camera, about = source.opened.camera(model)
@@ -88,7 +89,7 @@ def _of_film(source: Source, model: CameraParameters, given: float | None, note:
         return given
     except (NotCalibrated, ImageError) as error:
         note(_failed(source.name, error))
-    except (UserError, OSError):  # told where the film is read
+    except (UserError, OSError):  # reported where the film is read
         pass
     return given
 
@@ -100,7 +101,8 @@ def _rectification(
     name: str,
     note: Note,
 ) -> Rectification:
-    """Raises ImageError where the camera shows too little of the model's view."""
+    """Rectification of an estimated camera. Raises ImageError where it shows too little of the
+    model's view."""
     lens = Rectification(found.camera, model)
     for picture in shown[:1]:
         lens.image(picture)
@@ -114,7 +116,8 @@ def _failed(name: str, error: Exception) -> str:
 
 
 class DriveLens:
-    """Finds the camera of a stream while it runs: the model's or the one `given` until then."""
+    """Finds the camera of a stream while it runs; until then it is the model's or the one
+    `given`."""
 
     def __init__(self, name: str, model: CameraParameters, given: float | None, note: Note) -> None:
         self._name, self._model, self._given, self._note = name, model, given, note
@@ -125,7 +128,7 @@ class DriveLens:
         self._done = False
 
     def at(self, picture: Picture) -> Lens:
-        """The lens for this picture, which is the next one."""
+        """The lens for this picture, the next one in order."""
         if not self._done and picture.image is not None and picture.time_s is not None:
             self._take(picture.image, picture.time_s, picture.bgr)
         return self._lens

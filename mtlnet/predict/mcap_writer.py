@@ -1,11 +1,11 @@
-"""Predictions as an MCAP file that Foxglove opens: pictures, features, markings drawn over them.
+"""Writes predictions as an MCAP file for Foxglove: pictures, features, markings drawn over them.
 
     /camera/front               foxglove.CompressedImage: the picture in the model's view
     /camera/front/calibration   foxglove.CameraCalibration of that view, where it changes
     /camera/front/annotations   foxglove.ImageAnnotations: the predicted markings, and the features
     /features                   driverview.Prediction, JSON: the columns of a table of `predict`
 
-Absent features are left out of `/features`. The layout for Foxglove is written beside the file.
+Absent features are left out of `/features`. A layout for Foxglove is written next to the file.
 """
 
 import json
@@ -27,8 +27,8 @@ from datagen.recording.schema import messages, topics
 from datagen.recording.schema.polylines import CORNER_PX
 from mtlnet.inference.overlay import PREDICTION_COLOUR, Distances, marking_line
 from mtlnet.inference.prediction import ROAD_CLASSES, Prediction
-from mtlnet.predict.sources import SourceImage
 from mtlnet.predict.writers import feature_lines, table_row, view_of
+from mtlnet.sources.read import SourceImage
 from trackfeatures.camera import CameraParameters
 
 LAYOUT = "foxglove_layout.json"
@@ -37,12 +37,14 @@ FEATURES = "/features"
 SCHEMA = "driverview.Prediction"
 CODEC = "jpeg"
 SINCE_1970_S = 1e8
-"""A time of more is since 1970 (recordings, streams), one of less since the start of a film."""
+"""Times above this, s, are since 1970 (recordings, streams); others are since the start of a
+film."""
 ORANGE = Color(**dict(zip("rgb", (c / 255 for c in PREDICTION_COLOUR), strict=True)), a=1.0)
 
 
 class McapWriter:
-    """Each image and its prediction are messages of one log time; complete when it is closed."""
+    """Writes each image and its prediction as messages with one log time; close it to complete the
+    file."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
         self._path, self._model = path, camera
@@ -98,13 +100,13 @@ class McapWriter:
                 self._channels[topic], time, data, publish_time=time, sequence=self._count
             )
         except OSError as error:
-            error.filename = str(self._path)  # a failed write lacks it
+            error.filename = str(self._path)  # missing after a failed write
             raise
 
     def _log_time(self, time_s: float | None) -> int:
-        """In ns since 1970; of an image without a time one step after the one before it.
+        """Log time in ns since 1970; an image without a time follows one step after the last.
 
-        Films and rounds follow each other, whose times all begin at 0.
+        Consecutive films and rounds, whose times all start at 0, are placed one after another.
         """
         if time_s is None:
             time = self._last_ns + self._step_ns if self._last_ns else topics.EPOCH_NS
@@ -131,7 +133,7 @@ def annotations(
     item: SourceImage, prediction: Prediction, view: CameraParameters, time: Any
 ) -> bytes:
     """The predicted markings as polylines over the image, a round's labels too, and the features as
-    text. Without labels the lines are straight: the curvature is not predicted."""
+    text. Without labels the lines are straight, because the curvature is not predicted."""
     message = ImageAnnotations(timestamp=time)
     truth, curvature = item.truth, item.truth.curvature if item.truth else 0.0
     styles: list[tuple[Distances, float, Any]] = [
@@ -161,7 +163,7 @@ def annotations(
 
 
 def features_schema() -> dict[str, Any]:
-    """The JSON schema of `/features`, for Foxglove's panels."""
+    """JSON schema of `/features`, for Foxglove's panels."""
     number = {"type": "number"}
     names = [f"{marking}_m" for marking in tf.MARKINGS]
     names += ["to_lane_centre_m", "angle_rad", *(f"p_{name}" for name in ROAD_CLASSES)]

@@ -1,7 +1,7 @@
-"""`mtlnet predict`: the features of images of any source, yielded and written.
+"""`mtlnet predict`: predicts the features of the images of any source, and writes them.
 
 Three threads share the work: one decodes, one runs the network, one draws and writes. Each keeps
-the order, so answers and files do not depend on them.
+the order of images, so that answers and files do not depend on timing.
 """
 
 import time
@@ -14,27 +14,21 @@ from typing import Any, Self
 
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
-from mtlnet.predict.kinds import Kind
 from mtlnet.predict.lenses import with_lens
-from mtlnet.predict.pictures import Lens
-from mtlnet.predict.sources import (
-    DEFAULT_FPS,
-    READ_AHEAD,
-    Note,
-    SourceImage,
-    find_sources,
-    read_sources,
-)
-from mtlnet.predict.streams import Stream
 from mtlnet.predict.writers import Writer, open_writer, require_other_file
+from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
+from mtlnet.sources.kinds import Kind
+from mtlnet.sources.pictures import Lens
+from mtlnet.sources.read import READ_AHEAD, SourceImage, read_sources
+from mtlnet.sources.streams import Stream
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000
-"""Results returned at most; files get all."""
+"""Maximum number of results that are returned; files get all."""
 
 
 class InputsLeftOut(UserError):
-    """Inputs or images that could not be used; `results` are those of all others."""
+    """Some inputs or images could not be used; `results` are those of all others."""
 
     def __init__(self, message: str, results: list[dict[str, Any]]) -> None:
         super().__init__(message)
@@ -52,16 +46,18 @@ def predict_files(
     *,
     calibrate: bool = False,
 ) -> list[dict[str, Any]]:
-    """The features of all images that `inputs` name (`mtlnet.predict.sources.find_sources`).
+    """Predict the features of all images that `inputs` name (`mtlnet.sources.find.find_sources`).
 
-    Those of the first `KEPT_ROWS` are returned, all are written to each of `outputs`
-    (`mtlnet.predict.writers.open_writer`), one image at a time. `lens`: of all but recorded rounds,
-    which must be of the model's camera; None: what is known of the source, else the model's.
-    `report`: takes the numbers of images done and in all. `note`: takes a line on what is left out
-    or was found. `topic`: of recordings. `calibrate`: the camera of films and streams is found from
-    what they show. A stream ends also by Ctrl-C. Raises InputsLeftOut, after all others were done,
-    when an input or an image could not be used; UserError at once for outputs that cannot be
-    written or are among the files to read, or an impossible `lens`.
+    Returns the results of the first `KEPT_ROWS` images; all are written to each of `outputs`
+    (`mtlnet.predict.writers.open_writer`), image by image. `lens`: of all sources but recorded
+    rounds, which must be of the model's camera; None: what is known of the source, else the
+    model's. `report`: called with the numbers of images done and in total. `note`: called with a
+    line about what is left out or found. `topic`: of recordings. `calibrate`: estimate the camera
+    of films and streams from their pictures. Ctrl-C ends a stream normally.
+
+    Raises InputsLeftOut, after all others are done, when an input or an image could not be used;
+    UserError at once for an invalid `lens`, and for outputs that cannot be written or are among the
+    files to read.
     """
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
@@ -95,7 +91,7 @@ def predict_files(
 
 
 def answer(engine: Engine, item: SourceImage) -> Prediction:
-    """The features of an image that could be read, in metres beside its own camera."""
+    """The features of a readable image, in metres at its own camera."""
     assert item.image is not None
     outputs = engine(item.image)
     if item.lens is not None:
@@ -104,12 +100,12 @@ def answer(engine: Engine, item: SourceImage) -> Prediction:
 
 
 def first_of(errors: list[str]) -> str:
-    """The first of some errors, and the number of the others."""
+    """The first of some errors, with the number of the others."""
     return f"{errors[0]} (and {len(errors) - 1} more)" if len(errors) > 1 else errors[0]
 
 
 class _Answers:
-    """The answers so far, and what could not be used."""
+    """The answers so far, and the errors of unusable images."""
 
     def __init__(self, engine: Engine, total: int, report: Callable[[int, int], None]) -> None:
         self._engine, self._total, self._report = engine, total, report
@@ -142,9 +138,9 @@ class _Answers:
 
 
 class _Writing:
-    """Writes answers on a thread of its own, in their order.
+    """Writes answers in order on its own thread.
 
-    What fails there is raised by the next `write`, or at the end; nothing is written after it.
+    An error there is raised by the next `write` or at the end; nothing is written after it.
     """
 
     def __init__(self, writers: list[Writer]) -> None:
@@ -154,7 +150,7 @@ class _Writing:
         self._failed = False
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
-        """Write one answer soon; waits while `READ_AHEAD` others wait."""
+        """Write one answer soon; waits while more than `READ_AHEAD` others wait."""
         if self._writers:
             self._waiting.append(self._thread.submit(self._write, item, prediction))
         while self._waiting and (len(self._waiting) > READ_AHEAD or self._waiting[0].done()):

@@ -1,8 +1,8 @@
-"""Files that `mtlnet predict --out` writes: tables (.csv, .jsonl), a film (.mp4), a recording for
-Foxglove (.mcap) or pictures.
+"""Writers of the files of `mtlnet predict --out`: tables (.csv, .jsonl), a film (.mp4), a recording
+for Foxglove (.mcap) or pictures.
 
-Each row and frame is written when it is known: an interrupted command keeps what was done. A name
-that is not UTF-8 stands in tables as `runtime.files` describes.
+Each row and frame is written at once, so that an interrupted command keeps what was done. Names
+that are not UTF-8 are written in tables as described in `runtime.files`.
 """
 
 import csv
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction
-from mtlnet.predict.sources import SourceImage
+from mtlnet.sources.read import SourceImage
 from runtime.film import FILM_SUFFIX, Film
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -27,14 +27,15 @@ from trackfeatures.errors import UserError
 MCAP_SUFFIX = ".mcap"
 TABLE_SUFFIXES = (".csv", ".jsonl")
 TEXT_HEIGHT = 64
-"""Rows of pixels below a picture that hold the features as text."""
+"""Height of the text with the features below a picture, px."""
 TEXT_COLOUR = (235, 235, 235)
 MAX_STEM_BYTES = 200
-"""Of a picture's name, from its image: a name has 255 bytes at most."""
+"""Maximum length of the part of a picture's file name from its image, bytes; a file name has at
+most 255."""
 
 
 class Writer(Protocol):
-    """Takes one image and its prediction at a time; a context manager that closes its file."""
+    """Writes images and predictions one by one; a context manager that closes its file."""
 
     def write(self, item: SourceImage, prediction: Prediction) -> None: ...
 
@@ -44,9 +45,9 @@ class Writer(Protocol):
 
 
 def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
-    """The writer that the suffix of `path` asks for; one without a suffix is a folder of pictures.
+    """The writer for the suffix of `path`; a path without a suffix is a folder of pictures.
 
-    Raises UserError for another suffix, or a folder that does not exist.
+    Raises UserError for another suffix, or a parent folder that does not exist.
     """
     kind = path.suffix.lower()
     if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX, ""):
@@ -70,7 +71,7 @@ def require_other_file(path: Path, inputs: list[Path]) -> None:
 
 
 def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
-    """One image's features as a flat row; None for what is absent, unknown or not predicted."""
+    """Features of one image as a flat row; None for what is absent, unknown or not predicted."""
     std = prediction.std or {}
     row: dict[str, Any] = {"image": item.name, "time_s": item.time_s}
     for marking in tf.MARKINGS:
@@ -86,7 +87,7 @@ def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
 
 
 class TableWriter:
-    """Rows of `table_row` as CSV with a header, or as one JSON object a line."""
+    """Writes rows of `table_row` as CSV with a header, or as one JSON object per line."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -100,7 +101,7 @@ class TableWriter:
             self._write_row(row)
             self._file.flush()
         except OSError as error:
-            error.filename = str(self._path)  # a failed write lacks it
+            error.filename = str(self._path)  # missing after a failed write
             raise
 
     def _write_row(self, row: dict[str, Any]) -> None:
@@ -116,12 +117,13 @@ class TableWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(OSError):  # told by `write`: what a full disk did not take is still there
+        with suppress(OSError):  # `write` has reported it; on a full disk closing fails again
             self._file.close()
 
 
 class FilmWriter:
-    """Drawn frames as an MP4 film (MPEG-4), playable also when the command is interrupted."""
+    """Writes drawn frames as an MP4 film (MPEG-4), which is playable even if the command is
+    interrupted."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
         self._camera, self._film = camera, Film(path, fps)
@@ -137,7 +139,7 @@ class FilmWriter:
 
 
 class PictureWriter:
-    """Drawn frames as PNG files, `0000.png` and on, with the name of the image."""
+    """Writes drawn frames as PNG files named by a count from `0000` and the name of the image."""
 
     def __init__(self, folder: Path, camera: CameraParameters) -> None:
         self._folder, self._camera, self._count = folder, camera, 0
@@ -151,7 +153,7 @@ class PictureWriter:
         done, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         if not done:
             raise UserError(f"{name}.png: a picture of {picture.shape} cannot be written as PNG")
-        # Not with OpenCV, which takes UTF-8 names only, and does not say why it fails.
+        # Not with OpenCV, which needs UTF-8 names and does not report why it fails.
         (self._folder / f"{name}.png").write_bytes(data.tobytes())
         self._count += 1
 
@@ -163,7 +165,7 @@ class PictureWriter:
 
 
 def view_of(item: SourceImage, model: CameraParameters) -> CameraParameters:
-    """The camera that takes the image as the model sees it, from where the real one is."""
+    """The camera that takes the image in the model's view, from the place of the real camera."""
     return model if item.lens is None else item.lens.view
 
 
@@ -171,9 +173,9 @@ def draw_prediction(
     item: SourceImage, prediction: Prediction, model: CameraParameters
 ) -> NDArray[np.uint8]:
     """The image in the model's view with its markings drawn (prediction orange, a round's labels
-    green) beside a view from above, and the features as text below: uint8 RGB.
+    green), a view from above beside it, and the features as text below: uint8 RGB.
 
-    Of an image without labels the markings are drawn straight: the curvature is not predicted.
+    Without labels the markings are drawn straight, because the curvature is not predicted.
     """
     assert item.image is not None
     truth = item.truth
@@ -194,7 +196,8 @@ def draw_prediction(
 
 
 def feature_lines(prediction: Prediction) -> tuple[str, str]:
-    """The features as two lines of text: distances in m, then lane centre, angle and class."""
+    """The features as two lines of text: distances in m; offset from the lane centre, angle and
+    class."""
     distances = "  ".join(
         f"{name} {_metres(value)}" for name, value in prediction.distances_m.items()
     )

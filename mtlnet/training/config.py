@@ -1,73 +1,120 @@
-"""The configuration of a training run, from its options or from the `config.json` of a run."""
+"""The configuration of a training run: its fields are the options of `mtlnet train`.
 
-import json
+The defaults in the help are those of a new run; a resumed run keeps what it has stored.
+"""
+
 import math
-import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-import trackfeatures as tf
-from mtlnet.inference.model_card import (
-    RUNS,
-    WEIGHTS,
-    ModelCard,
-    ModelError,
-    check_files,
-    read_card,
-    resolve_run,
-)
-from mtlnet.model.architecture import find_architecture, require_task_heads, with_heads
-from mtlnet.training.distributed import read_rank
-from mtlnet.training.loss import Alpha
-from mtlnet.training.recipes import Recipe, find_recipe, learning_rate_factor
-from mtlnet.training.task_weighting import require_method
-from mtlnet.training.trainer import choose_device
-from runtime.files import write_json
+from typer import Option
+
+from mtlnet.architecture import find_architecture, require_task_heads
+from mtlnet.training.losses.alpha import Alpha, parse_alpha, require_method
+from mtlnet.training.recipes import find_recipe
 from trackfeatures.errors import UserError
 
 CONFIG = "config.json"
-DATASET = Path("datasets/default")
 MAX_THREADS = 1024
-# Fields that may change when a run is resumed; any other would make it a different run.
-RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run."""
+    """One training run. Raises UserError for values that are not possible."""
 
-    data: Path
-    out: Path
-    network: str = ""
-    """A name of `mtlnet.model.architecture.ARCHITECTURES`; empty: the recipe's own."""
-    alpha: Alpha = (0.3, 0.2, 0.5)
-    balance: str = "fixed"
-    """A name of `mtlnet.training.task_weighting.METHODS`; unless it is fixed, alpha only selects
-    the tasks that are learned."""
-    recipe: str = "fast"
-    iterations: int | None = None
-    """Steps; None: the recipe's, or as many as fit into `minutes`."""
-    minutes: float | None = None
-    """Duration of the training itself; the schedule then follows the time elapsed."""
-    init: str | None = None
-    """The run folder of the model to fine-tune."""
-    seed: int = 0
-    batch: int = 0
-    """Images a step; 0: the recipe's."""
+    data: Annotated[
+        Path,
+        Option(
+            help="Dataset folder or, with --init, a folder of images with a labels.csv.",
+            show_default="datasets/default",
+        ),
+    ]
+    out: Annotated[Path, Option(help="Folder of the run.", show_default="runs/DATE-RECIPE")]
+    network: Annotated[
+        str,
+        Option(
+            help="Architecture: grid, grid_residual, mtl (the paper's), deepdriving, "
+            "mobilenet_v3_small or regnet_y_400mf.",
+            show_default="grid; mtl for --recipe paper",
+        ),
+    ] = ""
+    """A name of `mtlnet.architecture.ARCHITECTURES`."""
+    alpha: Annotated[
+        Alpha,
+        Option(
+            parser=parse_alpha,
+            metavar="TEXT",
+            help="Weights of the distance, angle and class losses; 0 leaves a task out.",
+            show_default="0.3,0.2,0.5; 1,1,0 for deepdriving",
+        ),
+    ] = (0.3, 0.2, 0.5)
+    balance: Annotated[
+        str,
+        Option(
+            help="Method that sets the task weights: fixed (those of --alpha), uncertainty or dwa; "
+            "the last two use --alpha only to select tasks."
+        ),
+    ] = "fixed"
+    recipe: Annotated[
+        str,
+        Option(
+            help="Training recipe: fast (minutes), paper (days); with --init: tune (fine-tune on "
+            "few images) or continue (hours on new frames).",
+            show_default="fast; tune when --init is given",
+        ),
+    ] = "fast"
+    iterations: Annotated[
+        int | None,
+        Option(
+            help="Number of training steps.",
+            show_default="the recipe's; no limit when --minutes is given",
+        ),
+    ] = None
+    minutes: Annotated[
+        float | None,
+        Option(
+            help="Duration of the training, min; the learning rate follows the elapsed time.",
+            show_default="no limit",
+        ),
+    ] = None
+    init: Annotated[
+        str | None,
+        Option(
+            help='Model to start from: "default" or a run.', show_default="none: random weights"
+        ),
+    ] = None
+    seed: Annotated[int, Option(help="Seed of all random numbers.")] = 0
+    batch: Annotated[int, Option(help="Images per step.", show_default="the recipe's")] = 0
     rate_factor: float = 1.0
-    """Of the recipe's learning rate: `recipes.learning_rate_factor` for a run started on a GPU. It
-    is stored, so that a run goes on with its rate on any device."""
-    device: str = "auto"
-    threads: int = 0
-    """CPU threads; 0: one a core."""
-    skip_undecodable: bool = False
-    """Omit frames whose image cannot be decoded; the model's card lists them."""
-    hold_out_drives: str = ""
-    """Of pictures with a `labels.csv`: the drives to leave out, with commas between them."""
-    change_data: bool = False
-    """A resumed run continues on `data`, which is not the dataset it was started with."""
+    """Factor of the recipe's learning rate: `recipes.learning_rate_factor` for a run started on a
+    GPU. It is stored, so that a run keeps its rate on any device."""
+    device: Annotated[
+        str, Option(help="Device: auto (a GPU if there is one), cpu, cuda or cuda:NUMBER.")
+    ] = "auto"
+    threads: Annotated[int, Option(help="Number of CPU threads.", show_default="one per core")] = 0
+    skip_undecodable: Annotated[
+        bool,
+        Option(
+            "--skip-undecodable",
+            help="Leave out frames whose image cannot be decoded; the model's card lists them.",
+        ),
+    ] = False
+    hold_out_drives: Annotated[
+        str,
+        Option(
+            help="Drives of labels.csv to leave out of the training, separated by commas; "
+            "`mtlnet evaluate` reports them separately.",
+            show_default="none",
+        ),
+    ] = ""
+    change_data: Annotated[
+        bool,
+        Option(
+            "--change-data",
+            help="With --resume: allow --data to be another dataset than at the start of the run.",
+        ),
+    ] = False
 
     def __post_init__(self) -> None:
         if not self.network:
@@ -102,98 +149,3 @@ class TrainConfig:
         """Whether the network is trained with batch normalisation."""
         backbone = find_architecture(self.network).backbone
         return find_recipe(self.recipe).batch_norm or (bool(backbone) and self.init is None)
-
-
-def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
-    """The configuration of a new run; defaults are those of the network or of the `init` model."""
-    if out is None and read_rank().world_size > 1:
-        raise UserError("give --out: several processes must use the same folder for the run")
-    values: dict[str, Any] = {"data": DATASET, "recipe": "fast"}
-    if "init" in options:
-        run, card = open_pretrained(options["init"])
-        values.update(network=card.network, alpha=card.alpha, recipe="tune")
-        options = {**options, "init": str(run)}
-    elif network := options.get("network"):
-        values["alpha"] = find_architecture(network).default_alpha
-    values.update(options)
-    recipe = find_recipe(values["recipe"]).name
-    values.update(_for_gpu(values))
-    if heads := values.pop("heads", None):
-        if "init" in options:
-            raise UserError("a fine-tuned model keeps its heads; leave --heads out with --init")
-        values["network"] = with_heads(values.get("network", find_recipe(recipe).network), heads)
-    folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
-    return TrainConfig(out=folder, **values)
-
-
-def _for_gpu(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The batch and the factor of the learning rate of a new run, if it is trained on a GPU."""
-    if choose_device(values.get("device", "auto"), read_rank()).type != "cuda":
-        return {}
-    recipe = find_recipe(values["recipe"])
-    batch = values.get("batch") or recipe.gpu_batch or recipe.batch
-    return {"batch": batch, "rate_factor": learning_rate_factor(recipe, max(batch, 1))}
-
-
-def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
-    """The folder and card of the model to fine-tune; ModelError when it is missing or damaged."""
-    run = resolve_run(name)
-    card = read_card(run)
-    check_files(run, card, (WEIGHTS,))
-    return run, card
-
-
-def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
-    """Write `config.json` of a run."""
-    values = {**asdict(config), "data": str(config.data), "out": str(config.out)}
-    content = {
-        "definitions": tf.VERSION,
-        "config": {**values, "change_data": False},  # once: later the data is the run's own
-        "recipe": asdict(recipe),
-        "data": dict(data),
-    }
-    write_json(config.out / CONFIG, content)
-
-
-def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """The configuration of a run, and the description of its data. Raises ModelError."""
-    path = run / CONFIG
-    if not path.is_file():
-        raise ModelError(
-            f"{run} is not a training run ({CONFIG} is missing); give the --out of a run to resume"
-        )
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        tf.require_version(content["definitions"], f"the run in {run}")
-        values = content["config"]
-        values.update(data=Path(values["data"]), out=run, alpha=tuple(values["alpha"]))
-        return TrainConfig(**values), content["data"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ModelError(f"{path} is damaged ({error!r}); start a new run") from error
-
-
-def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
-    """The stored configuration, with the fields `given` on the command line.
-
-    Raises UserError when a field is given that would make it a different run.
-    """
-    stored, data = read_config(run)
-    given = dict(given)
-    if heads := given.pop("heads", None):
-        given["network"] = with_heads(given.get("network", stored.network), heads)
-    for name, value in given.items():
-        kept = getattr(stored, name)
-        if name not in RESUMABLE_WITH and value != kept:
-            raise UserError(
-                f"{run} was started with {name} {kept}, now {value} is asked for; leave it out to "
-                "resume, or start a new run with another --out"
-            )
-    return replace(stored, **{k: v for k, v in given.items() if k in RESUMABLE_WITH}), data
-
-
-def newest_run() -> Path:
-    """The run in `runs/` that was started last; ModelError when there is none."""
-    runs = [p.parent for p in RUNS.glob(f"*/{CONFIG}") if not p.parent.is_symlink()]
-    if not runs:
-        raise ModelError(f"there is no run in {RUNS}/ to resume; give its folder with --out")
-    return max(runs, key=lambda run: (run / CONFIG).stat().st_mtime)

@@ -1,9 +1,9 @@
-"""A training step recorded as a CUDA graph and replayed: one launch in place of hundreds.
+"""A training step recorded as a CUDA graph and replayed: one launch instead of hundreds.
 
-A replay uses the same memory as the recording: each batch is copied into the first one's, and
-numbers that change at every step, such as the learning rate, are tensors on the device. What else
-differs between steps, such as which layers are frozen, is a constant of the recording, which is
-repeated when that changes: twice in a run of recipe `fast`.
+A replay uses the memory of the recording: each batch is copied into the first one's memory, and
+values that change at every step, such as the learning rate, are tensors on the device. Other
+differences between steps, such as which layers are frozen, are constants of the recording. When
+they change, the step is recorded again: twice in a run of recipe `fast`.
 """
 
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from typing import Protocol
 import torch
 
 from mtlnet.data.gpu_cache import DeviceBatch
-from mtlnet.training.loss import Losses
+from mtlnet.training.losses.multi_task import Losses
 
 WARM_UP = 3
-"""Steps run before each recording, so that what the first steps allocate, and the kernels that they
-load, are not part of it."""
+"""Number of steps before each recording, so that their allocations and the loading of kernels are
+not recorded."""
 
 Work = Callable[[], Losses]
 
@@ -29,7 +29,7 @@ class Recorder(Protocol):
         """Run `work` now, on the stream on which it will be recorded."""
 
     def record(self, work: Work) -> Work:
-        """Record `work` without running it; the result runs it on the same memory."""
+        """Record `work` without running it; the returned function runs it on the same memory."""
 
 
 class CudaRecorder:
@@ -59,7 +59,7 @@ class CudaRecorder:
 
 
 class CudaGraphStep:
-    """Runs `work` on batches of one shape: directly `WARM_UP` times, then as a recorded graph."""
+    """Runs `work` on batches of one shape: `WARM_UP` times directly, then as a recorded graph."""
 
     def __init__(self, work: Callable[[DeviceBatch], Losses], recorder: Recorder) -> None:
         self._work = work
@@ -67,14 +67,15 @@ class CudaGraphStep:
         self._batch: DeviceBatch | None = None
         self._warm_up_left = WARM_UP
         self._constants: object = None
-        """Of the recording, or of the steps that prepare it."""
+        """The constants of the recording, or of the steps before it."""
         self._replay: Work | None = None
 
     def __call__(self, batch: DeviceBatch, constants: object) -> Losses:
-        """The losses of `work(batch)`; `constants`: Python values it depends on, compared by ==."""
+        """The losses of `work(batch)`. `constants`: the Python values that `work` depends on,
+        compared by ==."""
         static = self._copy_in(batch)
         if constants != self._constants:
-            self._replay = None  # frees the memory of the last graph before the next is recorded
+            self._replay = None  # frees the old graph's memory before the next recording
             self._constants, self._warm_up_left = constants, WARM_UP
         if self._warm_up_left:
             self._warm_up_left -= 1
@@ -82,11 +83,11 @@ class CudaGraphStep:
         if self._replay is None:
             self._replay = self._recorder.record(lambda: self._work(static))
         losses = self._replay()
-        # Copied, because the next replay overwrites the tensors of the graph.
+        # Copies, because the next replay overwrites the tensors of the graph.
         return Losses(*(getattr(losses, f.name).detach().clone() for f in fields(Losses)))
 
     def _copy_in(self, batch: DeviceBatch) -> DeviceBatch:
-        """The batch in the memory of the first one."""
+        """Copy the batch into the memory of the first one."""
         if self._batch is None:
             self._batch = DeviceBatch(
                 *(getattr(batch, f.name).clone() for f in fields(DeviceBatch))

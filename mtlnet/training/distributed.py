@@ -1,7 +1,8 @@
 """Several processes that train one network: `torchrun --nproc-per-node N -m mtlnet train ...`.
 
-Each computes its part of every batch. Gradients, losses and the statistics of batch normalisation
-are averaged, so that N processes take the steps of one. Only the first process writes files.
+Each process computes its part of every batch. Gradients, losses and the statistics of batch
+normalisation are averaged, so that N processes take the same steps as one. Only the first process
+writes files.
 """
 
 import os
@@ -17,12 +18,12 @@ from torch import Tensor
 
 from trackfeatures.errors import UserError
 
-TIMEOUT = timedelta(minutes=30)  # the other processes wait while the first one exports
+TIMEOUT = timedelta(minutes=30)  # the others wait while the first process publishes the model
 
 
 @dataclass(frozen=True)
 class Rank:
-    """The index of this process among all, and among those on this machine."""
+    """Index of this process and number of processes, in total and on this machine."""
 
     index: int = 0
     world_size: int = 1
@@ -39,7 +40,7 @@ SINGLE_PROCESS = Rank()
 
 
 def read_rank() -> Rank:
-    """This process's rank from the environment that torchrun sets; a single process without it."""
+    """Rank of this process from the environment set by torchrun; without it, a single process."""
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     values = [os.environ.get(name) for name in names]
     if None in values:
@@ -49,13 +50,13 @@ def read_rank() -> Rank:
 
 @contextmanager
 def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None]:
-    """Connects the processes; UserError when the batch does not divide among them."""
+    """Connect the processes. Raises UserError when the batch cannot be divided among them."""
     if rank.world_size == 1:
         yield
         return
     if batch % rank.world_size:
         raise UserError(
-            f"--batch {batch} does not divide among {rank.world_size} processes; give a multiple "
+            f"--batch {batch} cannot be divided among {rank.world_size} processes; give a multiple "
             f"of {rank.world_size}"
         )
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=TIMEOUT)
@@ -66,7 +67,7 @@ def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None
 
 
 def dropout_seed(seed: int, rank: int, step: int = 0) -> int:
-    """The seed of torch's generators in process `rank`, for a run that (re)starts at `step`.
+    """Seed of torch's generators in process `rank`, for a run that starts or resumes at `step`.
 
     It differs between processes, which would otherwise draw the same dropout masks for different
     images. The first process of a new run uses `seed` itself.
@@ -90,7 +91,7 @@ def average(tensors: Sequence[Tensor]) -> None:
 
 
 def broadcast(values: Sequence[float], device: torch.device) -> list[float]:
-    """The first process's values, for decisions that must be the same in all processes."""
+    """The first process's values, for decisions that all processes must share."""
     if not dist.is_initialized():
         return list(values)
     tensor = torch.tensor(values, dtype=torch.float64, device=device)
@@ -99,6 +100,6 @@ def broadcast(values: Sequence[float], device: torch.device) -> list[float]:
 
 
 def barrier() -> None:
-    """Wait until all processes have come here."""
+    """Wait until all processes reach this point."""
     if dist.is_initialized():
         dist.barrier()

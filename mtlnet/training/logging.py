@@ -1,4 +1,4 @@
-"""Logs the losses of a run in training: `curves.csv` and TensorBoard."""
+"""Logs the losses of a training run to `curves.csv` and TensorBoard."""
 
 import socket
 import time
@@ -15,9 +15,9 @@ from runtime.files import atomic_write
 
 
 class CurveLog:
-    """Appends points to the curves of `run`; points after `step` are dropped first.
+    """Appends points to the curves of `run`; stored points after `step` are dropped first.
 
-    They are left when a run was killed after its last checkpoint.
+    They exist if a run was killed after its last checkpoint.
     """
 
     columns = COLUMNS
@@ -53,7 +53,7 @@ def _line(cells: Iterable[str]) -> str:
 
 
 class TensorBoardWriter:
-    """Appends scalars to a new event file in `folder`; earlier points from `purge_step` are void.
+    """Writes scalars to a new event file in `folder`; earlier points from `purge_step` on are void.
 
     torch's SummaryWriter writes from a thread, which prints its own traceback on a full disk.
     """
@@ -69,7 +69,7 @@ class TensorBoardWriter:
             self._add(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, step: int, values: dict[str, float]) -> None:
-        """Add a point to the curve of each name."""
+        """Add one point to the curve of each name."""
         scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
         self._add(Event(step=step, summary=Summary(value=scalars)))
 

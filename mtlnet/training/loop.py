@@ -1,13 +1,11 @@
-"""The training loop: steps until the iterations or the minutes are used up, with checkpoints."""
+"""The training loop: takes steps until the iterations or minutes are used up; saves checkpoints."""
 
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from signal import SIGINT, SIGTERM
 
 import numpy as np
 import torch
@@ -20,11 +18,14 @@ from mtlnet.training.config import TrainConfig
 from mtlnet.training.distributed import broadcast
 from mtlnet.training.logging import CurveLog
 from mtlnet.training.trainer import Trainer
+from runtime.signals import interrupts
 from trackfeatures.errors import UserError
 
 LOG_EVERY = 10
-"""Steps between two points of the curves."""
+"""Number of steps between two points of the curves."""
 CHECKPOINT_SECONDS = 60.0
+STOPPING = (SIGINT, SIGTERM)
+"""Signals that stop a training between two steps."""
 DIVERGED = (
     "training stops and the last good checkpoint is kept; start a new run with smaller --alpha or "
     "another --seed, or check the data with `datagen verify`"
@@ -33,7 +34,7 @@ DIVERGED = (
 
 @dataclass(frozen=True)
 class TrainProgress:
-    """The state of a run: `fraction` done in [0, 1]; `losses` (distance, angle, heading, total)."""
+    """Progress of a run: `fraction` done in [0, 1]; `losses` (distance, angle, class, total)."""
 
     step: int
     fraction: float
@@ -43,7 +44,7 @@ class TrainProgress:
 
 
 class Stopped(KeyboardInterrupt):
-    """The user stopped the run; its argument is the path of the checkpoint."""
+    """The user stopped the run; the argument is the path of the checkpoint."""
 
 
 Report = Callable[[TrainProgress], None]
@@ -56,20 +57,20 @@ def train_loop(
     elapsed_s: float,
     report: Report,
 ) -> None:
-    """Train until the iterations or the minutes are used up, and save checkpoints on the way.
+    """Train until the iterations or the minutes are used up, and save checkpoints.
 
-    `elapsed_s`: seconds trained before this call. Raises Stopped after Ctrl-C, UserError when
+    `elapsed_s`: seconds trained before this call. Raises Stopped after Ctrl-C, UserError when the
     training diverges.
     """
     log = CurveLog(config.out, trainer.step_number) if trainer.rank.is_first else None
     begin = time.perf_counter() - elapsed_s
     saved = logged = time.perf_counter()
     window: list[torch.Tensor] = []
-    with log or nullcontext(), StopRequest() as stop:
+    with log or nullcontext(), interrupts(*STOPPING) as stop_requested:
         batches: Iterator[Batch | DeviceBatch] = loader.batches(trainer.step_number)
         while True:
             now = time.perf_counter()
-            own = [fraction_done(config, trainer, now - begin), stop.requested, now - saved]
+            own = [fraction_done(config, trainer, now - begin), stop_requested(), now - saved]
             fraction, stopping, unsaved_s = broadcast(own, trainer.device)
             if stopping or unsaved_s > CHECKPOINT_SECONDS:
                 require_finite(window, trainer.step_number)
@@ -81,7 +82,7 @@ def train_loop(
                 break
             losses = trainer.step(next(batches), fraction)
             window.append(losses.row())
-            if trainer.device.type == "cpu":  # on a GPU this would wait for the step to end
+            if trainer.device.type == "cpu":  # on a GPU this would wait for the step
                 require_finite(window[-1:], trainer.step_number)
             if trainer.step_number % LOG_EVERY == 0:
                 now = time.perf_counter()
@@ -98,7 +99,7 @@ def train_loop(
 
 
 def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
-    """Save a checkpoint in the first process; UserError when a weight is not finite."""
+    """Save a checkpoint in the first process. Raises UserError when a weight is not finite."""
     if not trainer.rank.is_first:
         return config.out
     if not all(bool(p.isfinite().all()) for p in trainer.network.parameters()):
@@ -109,7 +110,7 @@ def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
 
 
 def fraction_done(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
-    """The fraction of the run that is done: by steps or by time, whichever is larger."""
+    """Fraction of the run that is done: by steps or by time, whichever is larger."""
     recipe_steps = None if config.minutes is not None else trainer.recipe.iterations
     steps = config.iterations or recipe_steps
     by_steps = trainer.step_number / steps if steps else 0.0
@@ -131,38 +132,11 @@ def curve_point(progress: TrainProgress, trainer: Trainer) -> dict[str, float]:
 
 
 def require_finite(window: Sequence[torch.Tensor], step: int) -> None:
-    """Raise UserError when one of the last losses (4,) is not finite; `step`: that of the last."""
+    """Raise UserError when one of the last losses (4,) is not finite; `step`: the number of the
+    last."""
     for steps_before, losses in enumerate(reversed(window)):
         if not bool(losses.isfinite().all()):
             raise UserError(
                 f"the loss of batch {step - steps_before} is not a finite number (distance, angle, "
                 f"heading, total: {losses.tolist()}); {DIVERGED}"
             )
-
-
-class StopRequest:
-    """Within its context the first SIGINT or SIGTERM sets `requested`; a second one interrupts.
-
-    The training loop stops between two steps, never in the middle of one.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._handlers: dict[int, Any] = {}
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-
-    def __enter__(self) -> "StopRequest":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            try:
-                self._handlers[number] = signal.signal(number, self._handle)
-            except ValueError:  # only the main thread may, and only it is interrupted
-                break
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)

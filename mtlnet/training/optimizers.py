@@ -1,9 +1,9 @@
 """Optimizers: SGD, AdamW, or Muon for the large layers with AdamW for the others.
 
-Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; in short
-trials recipe `fast` needed half the images with it. It trains the layers whose matrix is cheap: the
-convolutions, the first shared layer and small shared layers. AdamW trains heads, biases, wide
-shared layers and torchvision's backbones, whose matrices have few rows.
+Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; with it,
+recipe `fast` needed half the images in short trials. It trains the layers whose matrix is cheap:
+the convolutions, the first shared layer and small shared layers. AdamW trains heads, biases, wide
+shared layers, and torchvision's backbones, whose matrices have few rows.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,19 +18,20 @@ from mtlnet.training.recipes import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
 MUON_MAX_SIDE = 1024
-"""Largest shorter side of a layer's matrix. The cost grows with its square: the 4096 of network
-`deepdriving` take two cores twenty seconds a step."""
+"""Maximum of the shorter side of a layer's matrix. The cost grows with its square: the side of 4096
+in network `deepdriving` takes two cores twenty seconds per step."""
 MUON_MAX_SHARED_SIDE = 512
-"""Largest longer side of the matrix of another shared layer than the first."""
+"""Maximum of the longer side of the matrix of a shared layer other than the first."""
 MUON_LR_SCALE = 8.0
-"""Muon's learning rate over the recipe's: with updates of AdamW's size it allows longer steps."""
+"""Ratio of Muon's learning rate to the recipe's: updates of AdamW's size allow longer steps with
+Muon."""
 
 
 class OptimizerSet:
-    """The optimizers of a network, stepped together; `extra`: parameters without weight decay.
+    """The optimizers of a network, stepped together. `extra`: parameters without weight decay.
 
-    `capturable`: a step can be recorded as a CUDA graph. Learning rates are then tensors beside the
-    weights, and Muon iterates on layers of one size together.
+    `capturable`: a step can be recorded as a CUDA graph. Learning rates are then tensors on the
+    weights' device, and Muon processes layers of one size together.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class OptimizerSet:
     ) -> None:
         self.optimizers: list[Optimizer] = []
         self.learning_rate = recipe.learning_rate
-        """The recipe's learning rate that is set."""
+        """The current learning rate of the recipe."""
         self.parameters = [*network.parameters(), *extra]
         self._matrices: list[tuple[nn.Parameter, nn.Parameter]] = []
         if recipe.optimizer == "sgd":
@@ -71,7 +72,7 @@ class OptimizerSet:
         self._keep_rates_as_tensors(capturable)
 
     def _keep_rates_as_tensors(self, capturable: bool) -> None:
-        """Replace the rates of all groups by tensors () on the weights' device."""
+        """Replace the learning rates of all groups by tensors () on the weights' device."""
         if not capturable:
             return
         for optimizer in self.optimizers:
@@ -80,7 +81,7 @@ class OptimizerSet:
                 group["lr"] = torch.tensor(group["lr"], dtype=torch.float32, device=device)
 
     def gradients(self) -> list[Tensor]:
-        """The gradients that exist, to be averaged over processes."""
+        """The existing gradients, to be averaged over processes."""
         return [p.grad for p in self.parameters if p.grad is not None]
 
     def zero_grad(self) -> None:
@@ -118,7 +119,7 @@ def uses_muon(name: str, weight: Tensor) -> bool:
 def as_matrix(weight: Tensor) -> Tensor:
     """A layer's weights (F, C, H, W) or (F, C) as a matrix (F, -1) that shares their memory.
 
-    The columns are in the order of channels-last memory; their order does not matter to Muon.
+    The columns are in the order of channels-last memory; Muon does not depend on their order.
     """
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).flatten(1)
 
@@ -132,22 +133,22 @@ def _groups(
     return groups
 
 
-# Muon with its iteration on the Gram matrix, in float32. A step goes along the gradient with its
-# singular values made (nearly) equal, by five Newton-Schulz iterations. torch's Muon iterates on
-# the whole matrix in bf16, which suits a GPU; on a CPU without bf16 that takes longer than the rest
-# of a training step. Each iteration multiplies by a polynomial of the Gram matrix, so that it can
-# run on the Gram matrix, which is small: the large matrix is read twice instead of ten times.
+# Muon with its iterations on the Gram matrix, in float32. A step follows the gradient with its
+# singular values made (nearly) equal by five Newton-Schulz iterations. torch's Muon iterates on the
+# whole matrix in bf16, which suits a GPU; on a CPU without bf16 that takes longer than the rest of
+# a training step. Each iteration multiplies by a polynomial of the Gram matrix, so it can run on
+# the small Gram matrix: the large matrix is read twice instead of ten times.
 
 
 RMS_OF_ADAMW = 0.2
-"""Root mean square of AdamW's updates, to which Muon's are scaled."""
+"""Root mean square of AdamW's updates, to which Muon's updates are scaled."""
 
 
 class GramMuon(Muon):
     """Muon for matrices (F, C), with the state of torch.optim.Muon.
 
-    `together`: iterate on the Gram matrices of one size as one batch, for a GPU, on which each of
-    these small products would leave most processors idle.
+    `together`: process the Gram matrices of one size as one batch. This is for a GPU, where each of
+    these small products alone would leave most processors idle.
     """
 
     def __init__(
@@ -195,15 +196,15 @@ Coefficients = tuple[float, float, float]
 def orthogonalize_each(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> Iterator[Tensor]:
-    """Yields `orthogonalize` of each matrix; computes one at a time, to keep one in memory."""
+    """Yields `orthogonalize` of each matrix; computes one at a time, to hold only one in memory."""
     return (orthogonalize(matrix, coefficients, steps, min_norm) for matrix in matrices)
 
 
 def orthogonalize_together(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> list[Tensor]:
-    """Returns what `orthogonalize_each` yields, but iterates on Gram matrices (F, F) of one size as
-    one batch (N, F, F)."""
+    """`orthogonalize` of each matrix; Gram matrices (F, F) of one size are processed as one batch
+    (N, F, F)."""
     all_of = list(matrices)
     wide = [_wide(matrix, min_norm) for matrix in all_of]
     of_size: dict[int, list[int]] = {}
@@ -220,7 +221,8 @@ def orthogonalize_together(
 def orthogonalize(
     matrix: Tensor, coefficients: Coefficients, steps: int, min_norm: float
 ) -> Tensor:
-    """`matrix` (F, C) with its singular values brought near 1; its norm is taken as >= `min_norm`.
+    """`matrix` (F, C) with its singular values brought near 1; its norm counts as at least
+    `min_norm`.
 
     Newton-Schulz iterations with a quintic polynomial (Jordan et al. 2024).
     """
@@ -229,7 +231,7 @@ def orthogonalize(
 
 
 def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Tensor:
-    """The polynomial of Gram matrices (F, F) or (N, F, F) by which the iterations multiply."""
+    """Polynomial of Gram matrices (F, F) or (N, F, F) by which the iterations multiply."""
     first, second, third = coefficients
     add_product = torch.addmm if gram.ndim == 2 else torch.baddbmm
     product: Tensor | None = None
@@ -245,7 +247,7 @@ def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Ten
 
 
 def _wide(matrix: Tensor, min_norm: float) -> Tensor:
-    """The matrix with the shorter side first, of norm 1."""
+    """The matrix, transposed if needed so that its shorter side comes first, with norm 1."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
     unit: Tensor = wide / wide.norm().clamp(min=min_norm)
     return unit

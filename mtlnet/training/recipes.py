@@ -1,64 +1,82 @@
 """Training recipes: `paper` as published, `fast` for a good model in minutes, `continue` to train a
-finished model on for hours, `tune` to fine-tune one on few images.
+finished model further for hours, `tune` to fine-tune a model on few images.
 
 `paper`: SGD with momentum 0.9, batch 32, learning rate 0.001 times 0.9 every 10,000 steps, 150,000
-steps. Dropout 0.5 and L2 5e-4 are our choice: the paper states neither.
+steps. Dropout 0.5 and L2 5e-4 are our choice, because the paper states neither.
 
 `fast` differs as follows.
-- Batch normalisation of the convolutions in training, folded away afterwards: learning is several
-  times faster. The shared layers have none, since batch statistics are noise to a distance. In the
-  last part of a run the statistics are frozen: the last convolutions have only some hundred places
-  a batch, and the network then trains as it will be used.
+
+- Batch normalisation of the convolutions in training, folded away afterwards: training is several
+times faster. The shared layers have none, because batch statistics add noise to the distances.
+The statistics are frozen in the last part of a run: the last convolutions have only some hundred
+places per batch, and the network is then trained in the form in which it is used.
 - The first two convolutions are frozen after a part of the run (FreezeOut, Brock et al. 2017): they
-  converge early, and take nearly nine tenths of a backward pass. The time saved goes into more
-  steps.
-- The heads predict in standard deviations of each target, and the loss counts errors in them: the
-  coded angle varies by 0.03 and a coded distance by 0.2, so that the angle would hardly be learned.
-- Muon for the large layers (`mtlnet.training.optimizers`): in short trials half as many images for
-  the same errors. The learning rate warms up, then falls to zero as a cosine; at twice the rate the
-  distances are worse by 2 to 28 % after 5 minutes of a core and by 9 to 43 % after 17. Batches of
-  64, since Muon's own cost does not grow with the batch.
-- Huber losses with a gain (`mtlnet.training.loss.HuberLoss`): `l`, `m` and `r` jump where they
-  become inactive, and a squared error asks for a value in between.
+converge early and take nearly nine tenths of a backward pass. The time saved gives more steps.
+- The heads predict in standard deviations of each target, and the loss is in the same units: the
+coded angle varies by 0.03 and a coded distance by 0.2, so the angle would hardly be learned.
+- Muon for the large layers (`mtlnet.training.optimizers`): in short trials it needed half as many
+images for the same errors. The learning rate warms up, then falls to zero along a cosine. At twice
+the rate the distance errors are larger by 2 to 28 % after 5 minutes on one core and by 9 to 43 %
+after 17. Batches of 64, because Muon's own cost does not depend on the batch.
+- Huber losses with gains (`HuberLoss`): `l`, `m` and `r` jump where they become inactive, and a
+squared error favours a value in between.
 - No dropout: it adds noise to outputs that must be accurate to a few per cent.
-- Images mirrored, turned, partly covered and changed in brightness, contrast and tint, with labels
-  that follow (`mtlnet.data.augment.pipeline`): rounds are few, and a network overfits to their
-  scenery.
+- Images are mirrored, rotated, partly covered and changed in brightness, contrast and tint, with
+their labels (`mtlnet.data.augment.pipeline`): rounds are few, and a network overfits their
+scenery.
 
-`continue`: `fast` from a finished model (`--init`), for hours on new frames; batch normalisation is
-put back first, and the network may get more residual convolutions (`mtlnet.model.pretrained`). The
-first convolution stays as it is; frames in sharp bends and near a change of class, where most
-errors are, are drawn twice as often (in a pilot of 5 minutes 0.89 of the wrong classes, 0.97 of the
-angle's error). With a learning rate of 1e-3 the model forgot more than it learned. The learning
-rate stays constant until the last fifth of the run, then falls to zero as one minus a square root
-(Hägele et al. 2024, "Scaling Laws and Compute-Optimal Training Beyond Fixed Training Durations").
-So a run that is stopped before can be prolonged (`--resume --minutes`), as if it had been planned
-longer from the start.
+`continue`: `fast` starting from a finished model (`--init`), for hours on new frames. Batch
+normalisation is restored first, and the network may get more residual convolutions
+(`mtlnet.model.pretrained`). The first convolution stays frozen. Frames in sharp bends and near a
+change of class, where most errors occur, are drawn twice as often; in a pilot of 5 minutes this
+left 0.89 of the wrong classes and 0.97 of the angle's error. With a learning rate of 1e-3 the model
+forgot more than it learned. The learning rate is constant until the last fifth of the run, then
+falls to zero as one minus a square root (Hägele et al. 2024, "Scaling Laws and Compute-Optimal
+Training Beyond Fixed Training Durations"). So a run that is stopped before that can be prolonged
+(`--resume --minutes`) as if it had been planned longer from the start.
 
-On a GPU `fast` and `continue` take `gpu_batch` images a step, unless `--batch` is given, and every
+On a GPU `fast` and `continue` take `gpu_batch` images per step unless `--batch` is given, and every
 recipe scales its learning rate by `learning_rate_factor`.
 
-`tune`: `fast` from a finished model (`--init`), with AdamW, a fifth of the learning rate, 500 steps
-and no batch normalisation.
+`tune`: `fast` starting from a finished model (`--init`), with AdamW, a fifth of the learning rate,
+500 steps and no batch normalisation.
 """
 
 import math
 from dataclasses import dataclass, replace
 
-from mtlnet.model.architecture import GRID, MTL
-from mtlnet.training.loss import HuberLoss
+from mtlnet.architecture import GRID, MTL
 from trackfeatures.errors import UserError
 
 
 @dataclass(frozen=True)
+class HuberLoss:
+    """The Huber loss (Huber 1964) of errors in standard deviations of their targets, with gains.
+
+    An error is squared up to `distance_beta` or `angle_beta` standard deviations and linear beyond.
+    Where a distance has two possible values, the minimum is then at the likelier one, while a
+    squared error has its minimum in between. The angle does not jump, so its beta is large.
+
+    The gains multiply the terms of distance and angle. Without them the cross-entropy of the class,
+    which stays large, outweighs both: with them the distances are learned far better, and nothing
+    is learned worse (docs/experiments/task-weights.md).
+    """
+
+    distance_beta: float
+    angle_beta: float = 1.0
+    distance_gain: float = 2.5
+    angle_gain: float = 5.0
+
+
+@dataclass(frozen=True)
 class Recipe:
-    """How a network is trained; stored in the run's `config.json`."""
+    """Settings of a training, stored in the run's `config.json`."""
 
     name: str
     network: str
-    """The network it trains unless another is given: the paper's recipe the paper's."""
+    """Default network of the recipe: the paper's for recipe `paper`."""
     optimizer: str
-    """sgd, adamw or muon (which leaves small layers to AdamW)."""
+    """Optimizer: sgd, adamw or muon (which uses AdamW for small layers)."""
     learning_rate: float
     batch: int
     iterations: int
@@ -71,18 +89,19 @@ class Recipe:
     freeze_bn_at: float = 1.0
     """Share of the run after which the statistics of batch normalisation are frozen."""
     huber: HuberLoss | None = None
-    """None: squared errors, without gains."""
+    """Huber losses and their gains; None: squared errors without gains."""
     freeze_schedule: tuple[tuple[float, int], ...] = ()
-    """(share, count): after this share of the run the first `count` convolutions are frozen."""
+    """Pairs (share, count): after this share of the run the first `count` convolutions are
+    frozen."""
     hard_repeats: int = 1
-    """How often frames of `mtlnet.data.road_ahead.hard_frames` are drawn in an epoch."""
+    """Number of times that each of `mtlnet.data.road_ahead.hard_frames` is drawn in an epoch."""
     from_model: bool = False
-    """Whether it starts from a finished model (`--init`)."""
+    """Whether the recipe starts from a finished model (`--init`)."""
     gpu_batch: int = 0
-    """Images a step on a GPU, which smaller batches do not fill; 0: `batch`."""
+    """Images per step on a GPU, which smaller batches do not fill; 0: as `batch`."""
     fall_from: float | None = None
-    """Share of the run up to which the learning rate is constant after its warm-up (adamw, muon).
-    None: it falls as a cosine from the warm-up on."""
+    """Share of the run up to which the learning rate is constant after the warm-up (adamw, muon).
+    None: it falls along a cosine after the warm-up."""
 
 
 HUBER = HuberLoss(distance_beta=0.05)
@@ -135,38 +154,38 @@ MOMENTUM = 0.9
 WARM_UP = 0.05
 """Share of a run over which the learning rate rises (adamw, muon)."""
 WARM_UP_STEPS = 500
-"""Steps after which it has risen, if the rate is constant afterwards: longer runs do not need
-more, and a run that is prolonged must not rise again."""
+"""Maximum number of warm-up steps if the rate is constant afterwards: longer runs do not need more,
+and a prolonged run must not warm up again."""
 DECAY, DECAY_STEPS = 0.9, 10_000
-"""Factor of the learning rate after so many steps (sgd)."""
+"""Factor of the learning rate, and steps between two applications of it (sgd)."""
 
 
 def find_recipe(name: str) -> Recipe:
-    """The recipe of that name; UserError when there is none."""
+    """The recipe with this name. Raises UserError when there is none."""
     if name not in RECIPES:
         raise UserError(f"there is no recipe {name!r}; choose one of {', '.join(RECIPES)}")
     return RECIPES[name]
 
 
 def frozen_convolutions(recipe: Recipe, progress: float) -> int:
-    """How many of the first convolutions are frozen at `progress` in [0, 1] of the run."""
+    """Number of first convolutions that are frozen at `progress` in [0, 1] of the run."""
     return max((count for share, count in recipe.freeze_schedule if progress >= share), default=0)
 
 
 def learning_rate_factor(recipe: Recipe, batch: int) -> float:
-    """The learning rate for batches of `batch` images over the recipe's own.
+    """Ratio of the learning rate for `batch` images per step to the recipe's own.
 
-    SGD: the ratio of the batches (Goyal et al. 2017, "Accurate, Large Minibatch SGD"). AdamW and
-    Muon, whose steps have the same length whatever the gradient's: its square root (Krizhevsky
-    2014; Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms",
-    who derive it for Adam; the momenta, which they scale too, stay as they are).
+    SGD: the ratio of the batch sizes (Goyal et al. 2017, "Accurate, Large Minibatch SGD"). AdamW
+    and Muon, whose step length does not depend on the gradient's: its square root (Krizhevsky 2014;
+    Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms", who
+    derive it for Adam; unlike there, the momenta are not scaled).
     """
     ratio = batch / recipe.batch
     return ratio if recipe.optimizer == "sgd" else math.sqrt(ratio)
 
 
 def learning_rate(recipe: Recipe, step: int, progress: float) -> float:
-    """The learning rate at `step`, at `progress` in [0, 1] of the run."""
+    """Learning rate at `step`, at `progress` in [0, 1] of the run."""
     if recipe.optimizer == "sgd":
         return recipe.learning_rate * DECAY ** (step // DECAY_STEPS)
     peak = recipe.learning_rate

@@ -1,45 +1,42 @@
-"""The trainer: a network, its optimizers and one training step; and the device it runs on."""
+"""The trainer: a network, its optimizers and one training step."""
 
-import ctypes
-import re
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mtlnet.architecture import MTL, Architecture
 from mtlnet.data.gpu_cache import DeviceBatch, on_device
 from mtlnet.data.loader import Batch, Loader
-from mtlnet.model.architecture import MTL, Architecture
 from mtlnet.model.auxiliary import auxiliary_loss
 from mtlnet.model.bins import Scores
 from mtlnet.model.cpu_kernels.forward import FAST, forward_grid, forward_shared, training_outputs
 from mtlnet.model.network import Network, initialise
-from mtlnet.training.bins_loss import bins_loss
 from mtlnet.training.cuda_graph import CudaGraphStep, CudaRecorder
 from mtlnet.training.distributed import SINGLE_PROCESS, Rank, average, dropout_seed
-from mtlnet.training.loss import Alpha, Losses, multi_task_loss
+from mtlnet.training.losses.alpha import Alpha
+from mtlnet.training.losses.bins import bins_loss
+from mtlnet.training.losses.multi_task import Losses, multi_task_loss
+from mtlnet.training.losses.task_weighting import TaskWeighting
 from mtlnet.training.optimizers import OptimizerSet
 from mtlnet.training.recipes import Recipe, frozen_convolutions, learning_rate
-from mtlnet.training.task_weighting import TaskWeighting
 from runtime.processor import has_bf16
-from trackfeatures.errors import UserError
 
 MIN_TARGET_STD = (0.01,) * 6
 FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
-"""Lower bounds of the heads' units (6,); to fine-tune, those of varied driving: a few images may be
-all alike."""
+"""Lower bounds of the heads' units (6,). For fine-tuning they are those of varied driving, because
+a few images may be nearly identical."""
 MIN_STEPS_BEFORE_BN_FREEZE = 100
-"""Steps until the running statistics of batch normalisation no longer depend on the first weights.
-"""
+"""Number of steps after which the running statistics of batch normalisation no longer depend on the
+initial weights."""
 
 
 class Trainer:
     """Trains a network; `step_number` counts the steps taken.
 
     `task_weighting`: None for the fixed weights `alpha`. `folded`: the network has no batch
-    normalisation, since it starts as a finished model.
+    normalisation, because it starts from a finished model.
     """
 
     def __init__(
@@ -55,7 +52,6 @@ class Trainer:
         folded: bool = False,
     ) -> None:
         self.recipe = recipe
-        self.alpha = alpha
         self.seed = seed
         self.device = device
         self.rank = rank
@@ -79,7 +75,8 @@ class Trainer:
         self.seed_dropout()
 
     def _cuda_graph(self) -> CudaGraphStep | None:
-        """The recorded step on a GPU; several processes exchange gradients within a step."""
+        """The recorded step on a GPU; None on a CPU, and for several processes, which exchange
+        gradients within a step."""
         if self.device.type != "cuda" or self.rank.world_size > 1:
             return None
         return CudaGraphStep(self.optimize, CudaRecorder(self.device))
@@ -87,7 +84,7 @@ class Trainer:
     def seed_dropout(self) -> None:
         """Seed torch's global generators, from which its dropout layers draw their masks.
 
-        These layers accept no generator of their own.
+        These layers do not accept a generator of their own.
         """
         if self.recipe.dropout:
             torch.manual_seed(dropout_seed(self.seed, self.rank.index, self.step_number))
@@ -95,7 +92,7 @@ class Trainer:
     def standardise(self, loader: Loader, *, fine_tune: bool = False) -> None:
         """Set the heads' units to the mean and standard deviation of the training targets.
 
-        `fine_tune`: the training starts from a finished model, perhaps on few images.
+        `fine_tune`: the training starts from a finished model, perhaps with few images.
         """
         if not self.recipe.standardise:
             return
@@ -111,7 +108,8 @@ class Trainer:
         self.target_variance = (std**2).float().to(self.device)
 
     def step(self, batch: Batch | DeviceBatch, progress: float) -> Losses:
-        """Train on one batch at `progress` in [0, 1] of the run; its losses before the step."""
+        """Train on one batch at `progress` in [0, 1] of the run; returns the losses before the
+        step."""
         self.network.train()
         settled = self.step_number >= MIN_STEPS_BEFORE_BN_FREEZE
         frozen_norm = settled and progress >= self.recipe.freeze_bn_at
@@ -129,7 +127,7 @@ class Trainer:
         return losses
 
     def optimize(self, batch: DeviceBatch) -> Losses:
-        """Update the weights by one batch, at the learning rate that is set."""
+        """Update the weights with one batch, at the current learning rate."""
         losses = self.losses(batch)
         self.optimizers.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
@@ -139,25 +137,22 @@ class Trainer:
         return losses
 
     def losses(self, batch: DeviceBatch) -> Losses:
-        """The losses of the current weights."""
+        """Losses of the current weights for a batch."""
+        total = self.task_weighting.total
         if self.network.architecture.bins:
             scores, auxiliary = self.scores(batch.images, batch.ahead)
-            return bins_loss(scores, batch.coded, batch.heading, self._combine(), auxiliary)
+            return bins_loss(scores, batch.coded, batch.heading, total, auxiliary)
         return multi_task_loss(
             self.outputs(batch.images),
             batch.coded,
             batch.heading,
-            self._combine(),
+            total,
             self.target_variance,
             self.recipe.huber,
         )
 
-    def _combine(self) -> Alpha | Callable[[Tensor], Tensor]:
-        weighting = self.task_weighting
-        return self.alpha if weighting.method == "fixed" else weighting.total
-
     def outputs(self, images: Tensor) -> Tensor:
-        """Outputs (B, 9) of the network in training for images (B, 210, 280, 3) uint8."""
+        """Outputs (B, 9) of the network in training for images uint8 (B, 210, 280, 3)."""
         dtype = self._dtype()
         if self.device.type == "cpu" and self.network.architecture.features in FAST:
             return training_outputs(self.network, images, dtype, self._masks(len(images)))
@@ -166,7 +161,8 @@ class Trainer:
         return outputs
 
     def scores(self, images: Tensor, ahead: Tensor) -> tuple[Scores, Tensor | None]:
-        """Scores of images (B, 210, 280, 3) uint8, and the auxiliary loss if there are labels."""
+        """Scores for images uint8 (B, 210, 280, 3), and the auxiliary loss if there are labels for
+        it."""
         network, dtype = self.network, self._dtype()
         if self.device.type == "cpu" and network.architecture.features in FAST:
             grid = forward_grid(network, images, dtype)
@@ -198,7 +194,7 @@ def freeze_batch_norm(network: Network) -> None:
 
 
 def freeze_convolutions(network: Network, count: int) -> None:
-    """Freeze the first `count` convolutions (no gradients), and unfreeze the others."""
+    """Freeze the first `count` convolutions (no gradients) and unfreeze the others."""
     for number, name in enumerate(network.architecture.convolutions):
         for parameter in network.features.get_submodule(name).parameters():
             parameter.requires_grad_(number >= count)
@@ -211,10 +207,11 @@ def dropout_masks(
     seed: list[int],
     part: tuple[int, int] = (0, 1),
 ) -> list[Tensor]:
-    """Dropout masks (count, units) of each layer of so many units, scaled by 1 / (1 - probability).
+    """Dropout masks (count, units), one for each layer of `units`, scaled by 1 / (1 - probability).
 
-    They are a function of the seed, so that a run can be resumed without a generator's state.
-    `part`: process and number of processes; the masks of all together are those of a single one.
+    They are a function of the seed, so that a run can be resumed without the state of a generator.
+    `part` (index, count): this process's part; the masks of all parts are those of a single
+    process.
     """
     if not probability:
         return []
@@ -223,34 +220,3 @@ def dropout_masks(
     rows = slice(index * count, (index + 1) * count)
     drawn = [rng.random((parts * count, units), np.float32)[rows] for units in layers]
     return [torch.from_numpy((d >= probability) / np.float32(1 - probability)) for d in drawn]
-
-
-def keep_freed_memory() -> None:
-    """Configure glibc to keep the memory of freed tensors: a step is then a sixth faster.
-
-    By default glibc returns it to the kernel, and each step causes 30,000 page faults.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:  # musl
-        return
-    trim_threshold, mmap_threshold = -1, -3
-    mallopt(trim_threshold, 2**31 - 1)
-    mallopt(mmap_threshold, 32 << 20)
-
-
-def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
-    """The device called `name`; "auto": a GPU where there is one. Raises UserError."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and rank.local_world_size > 1:
-        name = f"cuda:{rank.local_index}"
-    if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name):
-        raise UserError(f"--device {name!r} is unknown; use auto, cpu, cuda or cuda:NUMBER")
-    device = torch.device(name)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"--device {name}: torch finds no GPU on this machine; use --device cpu")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s)")
-    return device

@@ -1,1 +1,1 @@
-"""Fitting the uncertainty head of a trained network; the network itself is frozen."""
+"""Fits the uncertainty head of a trained network; the network itself is frozen."""

@@ -1,5 +1,5 @@
-"""Runs a network on frames, for the fit of its uncertainty head: the head's inputs, and the errors
-whose standard deviations it predicts."""
+"""Runs a network on frames for the fit of its uncertainty head: the inputs of the head, and the
+errors whose standard deviations it predicts."""
 
 import copy
 import os
@@ -12,37 +12,35 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.recording import Frames
+from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.data.loader import Images
 from mtlnet.data.model_labels import model_labels
 from mtlnet.evaluation.metrics import signed_errors
-from mtlnet.export.openvino_graph import build_feature_graph
 from mtlnet.inference.engine import best_precision, has_openvino, openvino_core
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.uncertainty import TEXTURE_VALUES, light_features, texture_features
-from mtlnet.model.architecture import HEIGHT, WIDTH
 from mtlnet.model.network import Network, run_network
+from mtlnet.openvino_graph import build_feature_graph
 
 CHUNK = 32  # images read at once
-
-Numbers = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class FrameOutputs:
-    """A frozen network's results on N frames.
+    """Results of a frozen network on N frames.
 
     An error is NaN where the label or, for `to_lane_centre`, the prediction is absent.
     """
 
-    x: Numbers  # (N, F) what the standard deviations are predicted from, the light included
-    error: Numbers  # (N, D) m and rad
-    texture: Numbers  # (N, T)
+    x: NDArray[np.float32]  # (N, F) inputs of the standard deviations, the light included
+    error: NDArray[np.float32]  # (N, D) m and rad
+    texture: NDArray[np.float32]  # (N, T)
 
 
 def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
     """Run `network` on up to `limit` evenly spaced frames.
 
-    By OpenVINO in the precision of the engine, where it is installed, else by torch in float32.
+    By OpenVINO in the engine's precision if it is installed, else by torch in float32.
     """
     chosen = np.linspace(0, len(frames) - 1, min(limit, len(frames))).astype(np.int64)
     run = _run_openvino if has_openvino() else _run_torch
@@ -55,11 +53,11 @@ def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
 
 def _run_torch(
     network: Network, frames: Images, chosen: NDArray[np.int64]
-) -> tuple[Numbers, Numbers, Numbers]:
-    """Computes what `_run_openvino` returns by torch in float32, on a GPU where there is one."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """The results of `_run_openvino` by torch in float32, on a GPU if there is one."""
     moved = copy.deepcopy(network).to("cuda" if torch.cuda.is_available() else "cpu")
     images = np.empty((CHUNK, HEIGHT, WIDTH, 3), np.uint8)
-    parts: list[tuple[Numbers, Numbers, Numbers]] = []
+    parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for first in range(0, len(chosen), CHUNK):
             rows = chosen[first : first + CHUNK]
@@ -73,10 +71,10 @@ def _run_torch(
 
 def _run_openvino(
     network: Network, frames: Images, chosen: NDArray[np.int64]
-) -> tuple[Numbers, Numbers, Numbers]:
-    """The network's inputs of the head (N, F), its outputs (N, 9) and the textures (N, T).
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Inputs of the head (N, F), outputs of the network (N, 9) and textures (N, T).
 
-    With one request a core: three times as fast as torch in float32.
+    With one request per core; three times as fast as torch in float32.
     """
     x = np.empty((len(chosen), network.architecture.uncertainty_inputs), np.float32)
     outputs = np.empty((len(chosen), OUTPUTS), np.float32)
@@ -99,7 +97,7 @@ def _run_openvino(
 
 
 def _infer_queue(network: Network) -> Any:
-    """As many parallel requests as there are cores, of one thread each."""
+    """One request per core, each with one thread."""
     import openvino
 
     cores = os.cpu_count() or 1

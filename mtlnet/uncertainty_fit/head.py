@@ -1,8 +1,8 @@
-"""Fitting the standard deviations of the uncertainty head (`mtlnet.inference.uncertainty`).
+"""Fits the standard deviations of the uncertainty head (`mtlnet.inference.uncertainty`).
 
-A network's errors on frames it was trained on are smaller than on new ones. So some train rounds
-are held out of its training (`mtlnet.data.sources.hold_out_rounds`); they determine the scale of
-the standard deviations and the limit of the out-of-distribution score.
+A network's errors are smaller on frames of its training than on new ones. Therefore some train
+rounds are held out of the training (`mtlnet.data.rounds.hold_out_rounds`); they determine the scale
+of the standard deviations and the limit of the out-of-distribution score.
 """
 
 import math
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.data.loader import Images
-from mtlnet.data.sources import (
+from mtlnet.data.rounds import (
     MIN_ROUNDS_TO_HOLD_OUT,
     hold_out_rounds,
     open_training_dataset,
@@ -46,31 +46,31 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FALSE_ALARM_RATE = 0.01
-"""Share of known frames classified as out of distribution: half by texture, half by pitch."""
+"""Share of known frames classified as out of distribution: half of it by texture, half by pitch."""
 MAX_TRAIN_FRAMES, MAX_HELD_OUT_FRAMES = 3_000, 24_000
 HIDDEN = 32
 FIT = FitSettings(steps=1_000, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 8
 MIN_FRAMES_TO_DIVIDE = 8
-"""Without held-out frames, every second of so many train frames sets the limits of what counts as
-known; all of fewer, else half of them would count as unfamiliar."""
-MIN_PRESENT_FRAMES = 30  # frames from which a feature has a temperature of its own
+"""Without held-out frames, every second train frame sets the limits of what counts as known, if
+there are at least this many. With fewer, all of them do: otherwise half would count as
+unfamiliar."""
+MIN_PRESENT_FRAMES = 30  # least number of frames for a feature's own temperature
 MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
 """Limits of a standard deviation, relative to the RMS error, which a few large errors determine."""
 MIN_FEATURE_STD_SHARE = 0.1
 MIN_LIGHT_STD = np.repeat([0.1, 0.1, 0.1, 0.02, 0.02], HALVES)
-"""About half of what the colours and contrasts of `light_features` vary by over all lights: a model
-of one scene sees less, and another scene must not be far away for it."""
+"""Lower limits for the standard deviations of `light_features`: about half of what colours and
+contrasts vary by over all lights. A model of one scene sees less variation, but another scene must
+not be far away for it."""
 LOG_STD_LIMITS = (math.log(MIN_STD_SHARE), math.log(MAX_STD_SHARE))
 COVERED = (0.6827, 0.9545)
 """Shares of a normal distribution within one and two standard deviations."""
 FREEDOM = 3.0
-"""Degrees of freedom of the Student t distribution that errors are fitted with: beside their usual
-size they have outliers, which under a normal distribution would determine the standard deviations
-(Lange, Little and Taylor 1989). Within two standard deviations lay 90 to 93 % of the errors of test
-rounds, 85 to 91 % with a normal distribution (docs/experiments/uncertainty.md)."""
-
-Numbers = NDArray[np.float32]
+"""Degrees of freedom of the Student t distribution that is fitted to the errors. Errors have
+outliers, which would determine the standard deviations under a normal distribution (Lange, Little
+and Taylor 1989). Within two standard deviations lay 90 to 93 % of the errors of test rounds, 85 to
+91 % with a normal distribution (docs/experiments/uncertainty.md)."""
 
 
 def fit_uncertainty_head(
@@ -80,11 +80,11 @@ def fit_uncertainty_head(
     seed: int,
     camera: CameraParameters | None = None,
 ) -> FittedUncertainty:
-    """Fit the uncertainty head of `network` (folded) on its train frames and held-out ones.
+    """Fit the uncertainty head of `network` (folded) on its train frames and on held-out frames.
 
     Without held-out frames it is fitted on the train frames alone, and its standard deviations are
-    too small; the model card then lists no held-out rounds. It does not read the light then: so few
-    rounds show too few sceneries.
+    too small; the model card then lists no held-out rounds. In that case it does not read the
+    light, because so few rounds show too few sceneries.
     """
     count = network.architecture.uncertainty_inputs
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)
@@ -93,7 +93,7 @@ def fit_uncertainty_head(
     unseen = None if held_out is None else run_on_frames(network, held_out, MAX_HELD_OUT_FRAMES)
     centre, scale = standardisation(known.x, count)
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the head is small: more threads take longer
+    torch.set_num_threads(1)  # the head is small, and more threads are slower
     known_z = standardise(known.x, centre, scale, count)
     held_out_z = (
         None if unseen is None else replace(unseen, x=standardise(unseen.x, centre, scale, count))
@@ -133,14 +133,14 @@ def fit_uncertainty_head(
 
 
 def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
-    """Fit the uncertainty head of the model in `run` anew on the train rounds of a dataset.
+    """Fit the uncertainty head of the model in `run` again, on the train rounds of a dataset.
 
     Its `about` also names the dataset and the seeds of these rounds. Raises ModelError for images
-    of another camera and for rounds that the model was trained on, where its errors are too small;
-    UserError for a dataset of too few rounds.
+    of another camera, and for rounds of the model's training, on which its errors are too small;
+    UserError for a dataset with too few rounds.
     """
     card, dataset = read_card(run), open_training_dataset(data)
-    # All are new to the model: the larger part determines the standard deviations.
+    # All rounds are new to the model: the larger part determines the standard deviations.
     many, few = hold_out_rounds(dataset)
     if few is None:
         raise UserError(
@@ -161,12 +161,15 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
     return replace(fitted, about={**fitted.about, **origin})
 
 
-def standardisation(x: Numbers, count: int) -> tuple[Numbers, Numbers]:
+def standardisation(
+    x: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean (F,) and inverse standard deviation (F,) of inputs (N, F), for `UncertaintyHead`.
 
-    The first `count` are the network's, the others the light. A feature that hardly varies counts
-    as varying by `MIN_FEATURE_STD_SHARE` of the mean: a unit that is silent on these frames would
-    be thousands of deviations away on others. Light varies by `MIN_LIGHT_STD` at least.
+    The first `count` inputs are the network's, the others the light. The standard deviation of a
+    feature counts as at least `MIN_FEATURE_STD_SHARE` of the mean one: a unit that is silent on
+    these frames would otherwise be thousands of deviations away on others. That of the light counts
+    as at least `MIN_LIGHT_STD`.
     """
     std = x.std(0)
     floor = max(MIN_FEATURE_STD_SHARE * float(std[:count].mean()), 1e-3)
@@ -175,9 +178,9 @@ def standardisation(x: Numbers, count: int) -> tuple[Numbers, Numbers]:
 
 
 def fit_std_layers(
-    z: Numbers, error: Numbers, seed: int, held_out: FrameOutputs | None
-) -> dict[str, Numbers]:
-    """Fit the layers that predict standard deviations; fields of `UncertaintyHead` by name.
+    z: NDArray[np.float32], error: NDArray[np.float32], seed: int, held_out: FrameOutputs | None
+) -> dict[str, NDArray[np.float32]]:
+    """Fit the layers that predict standard deviations; returns fields of `UncertaintyHead` by name.
 
     `z` (N, F): standardised features, `error` (N, D); `held_out`: frames with standardised `x`. The
     layers are fitted on all frames. Temperature scaling (Guo et al. 2017) brings the shares of
@@ -190,7 +193,7 @@ def fit_std_layers(
     rms = _rms_error(error)
     scaled, x = torch.from_numpy(error / rms), torch.from_numpy(z.astype(np.float32))
     everything = np.arange(len(z))
-    # In order, so that a part consists of rounds, not of single frames.
+    # In order, so that a part consists of rounds instead of single frames.
     parts = np.array_split(everything[first_judged:], FOLDS)
     log_std = torch.full_like(scaled, torch.nan)
     for part in parts:
@@ -211,7 +214,7 @@ def fit_std_layers(
     }
 
 
-def _rms_error(error: Numbers) -> Numbers:
+def _rms_error(error: NDArray[np.float32]) -> NDArray[np.float32]:
     """RMS (D,) of errors (N, D); a quarter of the feature's range if it is never present."""
     spans = [tf.RANGES[name if name in tf.RANGES else "m"] for name in FEATURES]
     absent = np.array([(span.hi - span.lo) / 4 for span in spans])
@@ -221,10 +224,10 @@ def _rms_error(error: Numbers) -> Numbers:
     return np.where(present.any(0), np.maximum(rms, 1e-6), absent).astype(np.float32)
 
 
-def _temperatures(ratio: Numbers) -> Numbers:
-    """Factors (D,) of the standard deviations, of ratios (N, D) of error to predicted deviation.
+def _temperatures(ratio: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Factors (D,) for the standard deviations, from ratios (N, D) of error to predicted deviation.
 
-    The median of the other features for one present in fewer than `MIN_PRESENT_FRAMES` frames.
+    A feature present in fewer than `MIN_PRESENT_FRAMES` frames gets the median of the others.
     """
     present = [column[~np.isnan(column)] for column in ratio.T]
     found = np.array([_temperature(c) if len(c) >= MIN_PRESENT_FRAMES else np.nan for c in present])
@@ -232,10 +235,11 @@ def _temperatures(ratio: Numbers) -> Numbers:
     return np.maximum(np.where(np.isnan(found), others, found), 1e-3).astype(np.float32)
 
 
-def _temperature(ratio: Numbers) -> float:
-    """The factor of which the larger miss of the two shares of `COVERED` is least.
+def _temperature(ratio: NDArray[np.float32]) -> float:
+    """The factor that minimises the larger deviation of the two shares from `COVERED`.
 
-    Outliers leave no factor that gives both: that of the first share covers less than the second.
+    Because of outliers no factor gives both shares: one that gives the first gives too little of
+    the second.
     """
     candidates = np.quantile(ratio, np.linspace(0.6, 0.9, 61))
     limits = np.outer([1.0, 2.0], candidates)
@@ -258,7 +262,7 @@ def _train(z: Tensor, error: Tensor, seed: int) -> "_StdLayers":
         mean: Tensor = (terms * present[rows]).mean()
         return mean
 
-    # Fewer steps for a few frames, against overfitting.
+    # Fewer steps for few frames, against overfitting.
     settings = replace(FIT, steps=min(FIT.steps, len(z) // 4))
     minimise(loss, layers.parameters(), len(z), settings, generator)
     return layers

@@ -1,13 +1,13 @@
-"""Fitting the out-of-distribution score: texture distance and camera pitch.
+"""Fits the out-of-distribution score: texture distance and camera pitch.
 
-The pitch regressor needs images of cameras with another pitch. They are made from training frames
+The pitch regressor needs images of cameras with other pitches. They are made from training frames
 by homographies, which are exact for a rotation about the optical centre (Hartley and Zisserman
 2004, section 8.4). Only views whose image centre lies within the frame are used, so that no
-extrapolated border is seen.
+extrapolated border is visible.
 
-The field of view of these images varies too, but is not predicted: on a straight flat road a wider
-view looks like that of a higher camera, except for the length of dashes. Tried: a field-of-view
-regressor detects only 2 to 5 % of the frames.
+The field of view of these images varies too but is not predicted: on a straight flat road a wider
+view looks like that of a higher camera, except for the length of dashes. A field-of-view regressor
+was tried; it detected only 2 to 5 % of the frames.
 """
 
 from collections.abc import Callable, Iterable
@@ -33,26 +33,26 @@ from mtlnet.inference.uncertainty import (
 from trackfeatures.camera import CameraParameters
 
 MIN_SPREAD = 0.05
-"""Lower limit of a cell value's standard deviation: cells may be flat in all training frames."""
+"""Lower limit of a cell value's standard deviation, because cells may be flat in all training
+frames."""
 RIDGE = 0.02
 """Added to the variance along each principal axis of standardised textures, against overfitting."""
 MAX_PITCH_RAD, MAX_LOG_ZOOM = 0.26, 0.5
-"""15 degrees; and the logarithm of the ratio of the tangents of half the field of view."""
+"""Limits of the views: pitch (15 degrees); logarithm of the ratio of the tangents of half the field
+of view."""
 PITCH_FRAMES, VIEWS_PER_FRAME = 1_500, 2
 CELL_NOISE = 1 / 255
-"""Half a grey level, for images that are all alike: an image that differs from them by so much in
-each cell is not out of distribution."""
+"""Half a grey level. An image that differs by this much in each cell from training images that are
+all alike is not out of distribution."""
 PITCH_UNIT_RAD = 0.1  # unit of the regression target
 MIN_PITCH_LIMIT_RAD = 0.02
-"""Lower limit of the pitch that counts as out of distribution, for datasets of a few frames."""
+"""Lower limit of the pitch that counts as out of distribution, for datasets of few frames."""
 HIDDEN = 64
-
-Numbers = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a small regressor is trained; see `minimise`."""
+    """Settings of the training of a small regressor; see `minimise`."""
 
     steps: int
     batch: int
@@ -64,8 +64,8 @@ FIT = FitSettings(steps=800, batch=256, learning_rate=3e-3, weight_decay=0.1)
 
 
 def fit_texture_distance(
-    known: Numbers, held_out: Numbers, false_alarm_rate: float
-) -> tuple[Numbers, Numbers]:
+    known: NDArray[np.float32], held_out: NDArray[np.float32], false_alarm_rate: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean (C,) and directions (C, C) of the Mahalanobis distance of texture cell values (N, C).
 
     Scaled so that a share `false_alarm_rate` of the held-out frames exceeds a squared distance of
@@ -83,7 +83,8 @@ def fit_texture_distance(
 
 
 def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw a pitch (rad, down positive) and a log zoom whose image centre lies in the frame."""
+    """Draw a pitch (rad, positive downwards) and a log zoom whose image centre lies in the
+    frame."""
     while True:
         pitch = rng.uniform(-MAX_PITCH_RAD, MAX_PITCH_RAD)
         log_zoom = rng.uniform(-MAX_LOG_ZOOM, MAX_LOG_ZOOM)
@@ -94,7 +95,8 @@ def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float
 def view_homography(camera: CameraParameters, pitch: float, log_zoom: float) -> NDArray[np.float64]:
     """Homography (3, 3) from pixels of `camera` to those of a camera with another view.
 
-    It looks `pitch` (rad) further down, and sees exp(`log_zoom`) times as far to the sides.
+    The other camera is pitched down by `pitch` (rad) and sees exp(`log_zoom`) times as far to the
+    sides.
     """
     u0, v0 = (camera.width - 1) / 2, (camera.height - 1) / 2
     scale = np.exp(-log_zoom)
@@ -116,8 +118,11 @@ def _centre_in_frame(camera: CameraParameters, pitch: float, log_zoom: float) ->
     return bool(inside.all() and (w > 0).all())
 
 
-def pitched_views(frames: Images, camera: CameraParameters, seed: int) -> tuple[Numbers, Numbers]:
-    """Centre texture features (N, M) of frames seen at other pitches, and these (N,), rad down."""
+def pitched_views(
+    frames: Images, camera: CameraParameters, seed: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Centre texture features (N, M) of frames seen at other pitches, and the pitches (N,), rad,
+    positive downwards."""
     rng = np.random.default_rng([seed, 4])
     chosen = np.linspace(0, len(frames) - 1, min(PITCH_FRAMES, len(frames))).astype(np.int64)
     image = np.empty((1, camera.height, camera.width, 3), np.uint8)
@@ -137,13 +142,13 @@ def pitched_views(frames: Images, camera: CameraParameters, seed: int) -> tuple[
 
 
 def fit_pitch_offset(
-    known: Numbers,
-    views: tuple[Numbers, Numbers],
-    held_out: Numbers,
+    known: NDArray[np.float32],
+    views: tuple[NDArray[np.float32], NDArray[np.float32]],
+    held_out: NDArray[np.float32],
     false_alarm_rate: float,
     seed: int,
-) -> dict[str, Numbers]:
-    """Fit the pitch regressor; the `pitch_*` fields of `UncertaintyHead`.
+) -> dict[str, NDArray[np.float32]]:
+    """Fit the pitch regressor; returns the `pitch_*` fields of `UncertaintyHead`.
 
     `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: those
     of `pitched_views`, and their pitches. Scaled so that a share `false_alarm_rate` of the held-out
@@ -172,8 +177,9 @@ def fit_pitch_offset(
     }
 
 
-def _train(z: Tensor, target: Tensor, seed: int) -> list[Numbers]:
-    """Weight, bias, weight and bias of two layers z (N, M) -> target (N, 1), by smooth L1 loss."""
+def _train(z: Tensor, target: Tensor, seed: int) -> list[NDArray[np.float32]]:
+    """Weight, bias, weight and bias of two layers z (N, M) -> target (N, 1), fitted by smooth L1
+    loss."""
     generator = torch.Generator().manual_seed(seed)
     layers = nn.Linear(z.shape[1], HIDDEN), nn.Linear(HIDDEN, 1)
     with torch.no_grad():
@@ -199,7 +205,7 @@ def minimise(
 ) -> None:
     """Minimise `loss(rows)` over random batches of rows of `count` samples.
 
-    AdamW, with a learning rate that decreases to 0 along a cosine.
+    By AdamW, with a learning rate that falls to 0 along a cosine.
     """
     optimizer = torch.optim.AdamW(
         parameters, settings.learning_rate, weight_decay=settings.weight_decay

@@ -7,7 +7,8 @@ outputs of torch in float32 for this image, computed when the model was publishe
 import numpy as np
 
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.model_card import ModelError, golden_image
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import ModelError
 from mtlnet.inference.prediction import OUTPUTS
 
 WARM_UP_RUNS = 3  # the first runs allocate memory and choose kernels

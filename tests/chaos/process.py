@@ -21,7 +21,7 @@ MODULES = (
     *("datagen.execution.merge", "datagen.export.run", "datagen.recording.integrity.recover"),
     *("datagen.recording.near_duplicates", "datagen.recording.split_report", "datagen.cli"),
     *("mtlnet.evaluation.evaluate", "mtlnet.evaluation.tables", "mtlnet.export.convert"),
-    *("mtlnet.training.run", "mtlnet.cli", "openvino", "openvino.opset13", "rich.progress"),
+    *("mtlnet.train", "mtlnet.cli", "openvino", "openvino.opset13", "rich.progress"),
     "torch._dynamo",
 )
 """What the commands import."""
@@ -169,7 +169,7 @@ def run_forked(
 
 def make_small() -> None:
     """Networks with few filters and units, and uncertainty heads fitted in a few steps."""
-    from mtlnet.model.architecture import ARCHITECTURES, GRID, MTL, Conv
+    from mtlnet.architecture import ARCHITECTURES, GRID, MTL, Conv
     from mtlnet.uncertainty_fit import head, ood
 
     for full in (MTL, GRID):

@@ -21,7 +21,8 @@ from datagen.recording import Dataset
 from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.index import open_round
 from docs.generate import error_classes
-from mtlnet.calibration.run import CalibrateConfig, calibrate
+from mtlnet.calibration.config import CalibrateConfig
+from mtlnet.calibration.run import calibrate
 from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.evaluation.protocol import drive_rows
 from mtlnet.inference.engine import Engine, load_engine
@@ -31,9 +32,9 @@ from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import fit_markings
 from mtlnet.label.import_table import import_labels
-from mtlnet.predict.films import Film, read_film_header
 from mtlnet.predict.run import predict_files
-from mtlnet.training.loss import parse_alpha
+from mtlnet.sources.films import Film, read_film_header
+from mtlnet.training.losses.alpha import parse_alpha
 from runtime.camera_file import read_camera
 from serve.cameras import read_cameras
 from simulator.camera.core.context import Graphics
@@ -45,7 +46,7 @@ from simulator.varied.road import make_road
 from simulator.vehicle.state import Command
 from simulator.world.world import World
 from tests.mtlnet.conftest import write_dataset
-from tests.mtlnet.predict import recorded
+from tests.mtlnet.sources import recorded
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 

@@ -7,14 +7,8 @@ from typing import Any
 import pytest
 
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import (
-    SHIPPED,
-    SHIPPED_FILES,
-    ModelError,
-    file_hash,
-    read_card,
-    resolve_run,
-)
+from mtlnet.inference.model_card import SHIPPED, SHIPPED_FILES, ModelError, read_card, resolve_run
+from runtime.files import file_hash
 from tests.typed import typed
 
 MAX_BYTES = 18_000_000
@@ -47,7 +41,7 @@ def test_other_weights_in_the_place_of_the_shipped_ones_are_refused(
     card = json.loads((tmp_path / "card.json").read_text())
     card["files"]["model.safetensors"] = "0" * 64
     (tmp_path / "card.json").write_text(json.dumps(card))
-    with pytest.raises(ModelError, match="not the weights that ship with this version"):
+    with pytest.raises(ModelError, match="does not hold the weights of this version"):
         read_card(resolve_run("default"))
 
 

@@ -14,10 +14,10 @@ from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace
 from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.splits import Split, split_path, write_split
-from mtlnet.evaluation.metrics import describe_data
+from mtlnet.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, Conv
+from mtlnet.data.description import describe_data
 from mtlnet.export.publish import Provenance, publish
 from mtlnet.inference.prediction import decode_outputs
-from mtlnet.model.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, Conv
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.config import TrainConfig
 from mtlnet.uncertainty_fit import ood
@@ -57,7 +57,8 @@ def drawn_frame(rng: np.random.Generator) -> Frame:
 
 
 def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
-    """Write a round of `FRAMES` drawn frames to a dataset folder; `changes` to its header."""
+    """Write a round of `FRAMES` drawn frames to a dataset folder; `changes`: fields of its
+    header."""
     rng = np.random.default_rng(number)
     values: dict[str, Any] = {
         "id": name,
@@ -79,22 +80,20 @@ def write_round(folder: Path, name: str, number: int, **changes: Any) -> None:
 
 
 HIGH_CAMERA = CameraParameters(z=1.55)
-"""1.8 m above the road, half as high again as the model's."""
+"""A camera 1.8 m above the road, 1.5 times as high as the model's."""
 HIGH_ROUNDS: dict[str, Any] = {
     "camera": HIGH_CAMERA,
     "nominal_camera": CameraParameters(),
     "varied": {"carriageway": {"markings": [{"lines": [{"offset_m": 0.0}]}, {"lines": []}]}},
 }
-"""What the headers of such rounds of varied roads have; one lane, without paint on its right."""
+"""Header fields of such rounds of varied roads: one lane, without paint on its right."""
 
 
 def write_dataset(
     folder: Path, first_seed: int = 0, train_rounds: int = len(TRAIN), **changes: Any
 ) -> Path:
-    """Train rounds and a test round in an existing, empty folder, which is returned.
-
-    `changes`: to the headers of the rounds.
-    """
+    """Write train rounds and a test round to an existing, empty folder; returns it. `changes`:
+    header fields."""
     (folder / "rounds").mkdir()
     *train, test = (f"r{number:03}" for number in range(train_rounds + 1))
     for number, name in enumerate((*train, test)):
@@ -107,11 +106,8 @@ def write_dataset(
 def require_close(
     outputs: NDArray[np.float32], expected: NDArray[np.float32], *, metres: float, radians: float
 ) -> None:
-    """Assert that a model's outputs decode to nearly the same features.
-
-    `metres`: of distances and offset; `radians`: of the angle; probabilities of the heading may
-    differ by 0.02.
-    """
+    """Assert that the outputs of two models decode to nearly the same features. `metres`: tolerance
+    of distances and offset; `radians`: of the angle; that of the class probabilities is 0.02."""
     found, wanted = decode_outputs(outputs), decode_outputs(expected)
     assert found.distances_m == pytest.approx(wanted.distances_m, abs=metres)
     assert found.to_lane_centre_m == pytest.approx(wanted.to_lane_centre_m, abs=metres)
@@ -142,7 +138,7 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the default network and the paper's by ones with few filters and units."""
+    """Replace the default network and the paper's by networks with few filters and units."""
     for full in (MTL, GRID):
         few = tuple(
             replace(spec, filters=8) if isinstance(spec, Conv) else spec for spec in full.features
@@ -153,12 +149,13 @@ def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit the pitch of a trained model in 40 steps to 8 frames; else it takes 2 s a training."""
+    """Fit the pitch of a trained model in 40 steps on 8 frames; otherwise it takes 2 s per
+    training."""
     monkeypatch.setattr(ood, "FIT", replace(ood.FIT, steps=40))
     monkeypatch.setattr(ood, "PITCH_FRAMES", 8)
 
 
 def training_config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:
-    """Of a run of four steps, for a dataset of `write_dataset`."""
+    """Configuration of a run of four steps on a dataset of `write_dataset`."""
     values = {"iterations": 4, "batch": 4, "seed": 7, "device": "cpu", "threads": 1, **changes}
     return TrainConfig(dataset, out, **values)

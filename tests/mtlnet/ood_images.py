@@ -31,7 +31,7 @@ def noise(rng: np.random.Generator) -> Image:
 
 
 def clouds(rng: np.random.Generator) -> Image:
-    """Noise of all scales, like a texture of stone or foliage."""
+    """Noise at all scales, like a texture of stone or foliage."""
     total = np.zeros((HEIGHT, WIDTH, 3))
     for octave in range(1, 8):
         layer = rng.normal(size=(2**octave, 2**octave, 3)) / octave
@@ -79,7 +79,7 @@ def text(rng: np.random.Generator) -> Image:
 
 
 def interior(rng: np.random.Generator) -> Image:
-    """Similar to a photograph of a room: smooth walls, boxes with shaded sides."""
+    """An image similar to a photograph of a room: smooth walls, boxes with shaded sides."""
     image = gradient(rng) // 2 + clouds(rng) // 6
     for _ in range(rng.integers(3, 9)):
         x, y = rng.integers(0, WIDTH - 30), rng.integers(40, HEIGHT - 20)
@@ -92,10 +92,8 @@ def interior(rng: np.random.Generator) -> Image:
 def seen_by(
     image: Image, camera: CameraParameters, fov_y_deg: float, pitch_deg: float = 0.0
 ) -> Image:
-    """The image of a camera with another field of view and pitch (down positive) at the same place.
-
-    Exact where `image` shows the scene; beyond it the border is replicated.
-    """
+    """The image of a camera with another field of view and pitch (positive downwards) at the same
+    place. Exact where `image` shows the scene; the border is replicated beyond it."""
     inside, outside = (_intrinsics(camera, fov) for fov in (camera.fov_y_deg, fov_y_deg))
     down = np.radians(pitch_deg)
     cosine, sine = np.cos(down), np.sin(down)

@@ -1,4 +1,4 @@
-"""Parses the HTML pages that the project writes: their elements, and whether each is closed."""
+"""Parses the project's HTML pages: their elements, and whether each is closed."""
 
 import re
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ ENDS = {
     "p": ("p",),
     "table": ("p",),
 }
-"""By element: the open elements that its start tag ends."""
+"""By element: the open elements that its start tag closes."""
 
 
 @dataclass
@@ -25,14 +25,14 @@ class Element:
     attributes: dict[str, str]
     text: str = ""
     inside: list[str] = field(default_factory=list)
-    """Tags around it, from the outermost."""
+    """Enclosing tags, outermost first."""
 
     def has_class(self, name: str) -> bool:
         return name in self.attributes.get("class", "").split()
 
 
 class Page(HTMLParser):
-    """The elements of a page in their order; AssertionError when one is not closed."""
+    """The elements of a page in order. Raises AssertionError when one is not closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Page(HTMLParser):
         assert not left, f"never closed: {left}"
 
     def all(self, tag: str, kind: str | None = None) -> list[Element]:
-        """Elements called `tag`, of class `kind`."""
+        """Elements with this `tag` and class `kind`."""
         return [e for e in self.elements if e.tag == tag and (kind is None or e.has_class(kind))]
 
     def rows(self, table: int) -> list[list[str]]:
@@ -53,7 +53,7 @@ class Page(HTMLParser):
         return self._tables[table]
 
     def require_self_contained(self) -> None:
-        """AssertionError when the page needs the network or another file."""
+        """Raise AssertionError when the page needs the network or another file."""
         for element in self.elements:
             assert element.tag not in ("script", "link", "iframe", "object"), element
             for name in ("src", "href", "srcset", "action", "data"):

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from mtlnet import Features, Model, load
 from mtlnet.cli import app
+from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
 from runtime.camera_file import write_camera
@@ -94,7 +94,8 @@ def test_a_camera_file_gives_metres_beside_that_camera(
 
 
 def test_markings_are_drawn_on_the_picture_in_its_own_size_and_lens(model: Model) -> None:
-    """Of a wide picture, a distorted camera and the model's view: orange pixels lie on the line."""
+    """For a wide picture, a distorted camera and the model's view, orange pixels lie on the
+    expected line."""
     bent = CameraParameters(
         640, 480, 70.0, pitch_deg=4.0, distortion="opencv", coefficients=(-0.2, 0.05, 0.0, 0.0)
     )
@@ -115,7 +116,8 @@ def test_markings_are_drawn_on_the_picture_in_its_own_size_and_lens(model: Model
 
 
 def test_a_field_of_view_is_that_of_the_drawing_too(model: Model) -> None:
-    """A wider lens: the model's view of it has the answer drawn as the model's own picture has."""
+    """With a wider lens, the model's view of it shows the same drawing as the model's own
+    picture."""
     road = golden_image(1120, 840)
     wide = np.full((1680, 2240, 3), 128, np.uint8)
     wide[420:1260, 560:1680] = road
@@ -160,7 +162,7 @@ def test_a_folder_gives_all_that_can_be_read_then_the_error(
     for features in model.predict(str(tmp_path / "*.png")):
         names.append(Path(features.name).name)
     assert names == ["frame2.png", "frame10.png"]
-    one = model.predict(str(tmp_path / "*2.png"))  # a pattern of one file is no single image
+    one = model.predict(str(tmp_path / "*2.png"))  # a pattern of one file is not a single image
     assert [Path(features.name).name for features in one] == ["frame2.png"]
 
 

@@ -1,4 +1,4 @@
-"""The `mtlnet` command: what it prints, and one clear line for each mistake of the user."""
+"""The `mtlnet` command: its output, and one clear line for each mistake of the user."""
 
 import json
 import shutil
@@ -11,8 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import simplejpeg
+from typer.main import get_command
+from typer.testing import CliRunner
 
 from datagen.recording.splits import Split, split_path, write_split
+from mtlnet import cli as mtlnet_cli
 from mtlnet.inference.curves import read_curves
 from tests.typed import error_line, typed
 
@@ -161,3 +164,11 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path
     assert step >= 10
     done = mtlnet("train", "--out", run, "--resume", "--iterations", step + 1, "--json")
     assert json.loads(done.stdout)["iterations"] == step + 1, done.stderr
+
+
+def test_help_shows_the_default_of_every_option_with_a_value() -> None:
+    app = mtlnet_cli.app
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]  # a group's
+        options = [p for p in command.params if p.param_type_name == "option" and not p.is_flag]
+        shown = CliRunner().invoke(app, [name, "--help"]).output
+        assert shown.count("[default: ") == sum(not option.required for option in options), name

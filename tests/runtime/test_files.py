@@ -12,6 +12,7 @@ from runtime.files import (
     STAGED,
     atomic_write,
     check_folder,
+    file_hash,
     locked_folder,
     replaced_files,
     try_lock,
@@ -130,3 +131,9 @@ def test_a_locked_folder_is_refused_to_others_until_the_context_ends(tmp_path: P
             pass
     with locked_folder(tmp_path):
         pass
+
+
+def test_the_hash_of_a_file_is_sha_256(tmp_path: Path) -> None:
+    path = tmp_path / "abc"
+    path.write_bytes(b"abc")  # the example of FIPS 180-2, appendix B.1
+    assert file_hash(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

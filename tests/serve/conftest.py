@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.model_card import WEIGHTS, ModelCard, golden_image
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import WEIGHTS, ModelCard
 from runtime.sockets import bind
 from serve import shared_memory
 from serve.app import Service

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import CARD, SHIPPED, golden_image, read_card
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import CARD, SHIPPED, read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.client import Client

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import golden_image, read_card
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
 from serve.cli import main

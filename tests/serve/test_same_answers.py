@@ -13,8 +13,8 @@ from websockets.sync.client import connect
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine, load_engine
+from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.image_decoding.decode import decode, inspect
-from mtlnet.inference.model_card import golden_image
 from mtlnet.inference.prediction import decode_outputs
 from serve.scheduling.warmup import TOLERANCE, warm_up
 from serve.shared_memory import create_shared_memory

@@ -1,1 +1,1 @@
-"""Augmentation of training images, with labels that change accordingly."""
+"""Augmentation of training images and their labels."""

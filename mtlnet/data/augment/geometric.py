@@ -1,12 +1,12 @@
-"""Augmentation by another pose of the camera: lateral shift and rotation, and their labels.
+"""Augmentation by another camera pose: lateral shift and rotation, with their labels.
 
-Lateral shift: a camera that moves left by s sees a point at depth Z f s / Z pixels further right.
-On a flat road that is s / h pixels for each row below the horizon, with h the height of the camera,
-so the image is sheared there and unchanged above. Right for markings near the car; objects on the
-road are sheared too.
+Lateral shift: when the camera moves left by s, a point at depth Z appears s f / Z px further right.
+On a flat road that is s / h px per row below the horizon, with h the height of the camera. So the
+image is sheared below the horizon and unchanged above it. This is correct for markings near the
+car; objects that stand on the road are sheared too.
 
-Rotation: exact for any scene, except at the border, because a rotation about the optical centre is
-a homography (Hartley and Zisserman 2004, section 8.4).
+Rotation: exact for any scene except at the image border, because a rotation about the optical
+centre is a homography (Hartley and Zisserman 2004, section 8.4).
 """
 
 from dataclasses import replace
@@ -23,39 +23,40 @@ from trackfeatures.camera import CameraParameters
 MAX_SHIFT_M = 0.6
 YAW_STD_RAD, PITCH_STD_RAD = 0.035, 0.006
 MAX_YAW_RAD = 0.09
-ROTATIONS = 64  # rotations to choose from, with maps that are computed once; number 0 is none
+ROTATIONS = 64  # number of rotations, whose maps are computed once; number 0 is none
 
 
 def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: float) -> None:
-    """Move the camera of an image (H, W, 3) to the left by `metres`, in place."""
+    """Shift the camera of an image (H, W, 3) to the left by `metres`, in place."""
     horizon = horizon_row(camera)
     first = max(int(np.ceil(horizon)), 0)
     road = image[first:]
     shear = metres * shear_per_metre(camera)
     matrix = np.array([[1.0, shear, shear * (first - horizon)], [0.0, 1.0, 0.0]])
-    # The new border is filled with the mean colour of the road: mirrored markings would be wrong.
+    # The new border gets the mean colour of the road; mirrored markings would be wrong there.
     fill = image[-1].mean(0).tolist()
     size = (camera.width, len(road))
     cv2.warpAffine(road.copy(), matrix, size, dst=road, flags=cv2.INTER_LINEAR, borderValue=fill)
 
 
 def horizon_row(camera: CameraParameters) -> float:
-    """Row of a level road's horizon, px from the centre of the first row."""
+    """Row of the horizon of a level road, px from the centre of the first row."""
     middle = camera.intrinsics()[1, 2]
     return float(middle - camera.focal_px * np.tan(np.radians(camera.pitch_deg)))
 
 
 def shear_per_metre(camera: CameraParameters) -> float:
-    """Shift of a row to the right, in px per row below the horizon and metre to the left."""
+    """Shift of a row to the right, px per row below the horizon and per metre to the left."""
     return float(np.cos(np.radians(camera.pitch_deg)) / camera.height_above_road_m)
 
 
 def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Limits (N, 2) of a shift to the right (negative) and left, m, within which labels are known.
+    """Limits (N, 2) of a shift to the right (negative) and to the left, m, within which labels stay
+    known.
 
-    `distances` (N, 5) in m, NaN where absent. Beyond the limits another marking would be measured,
-    whose distance, or presence, is not known. A marking that the label calls unknown sets no limit
-    within a lane, and allows no shift elsewhere.
+    `distances` (N, 5) in m, NaN where absent. Beyond a limit another marking would be measured,
+    whose distance or presence is not known. A marking with an unknown label sets no limit within a
+    lane and allows no shift elsewhere.
     """
     unknown = np.isinf(distances)
     ml, mr, l, m, r = np.where(unknown, np.nan, distances).astype(np.float64).T
@@ -86,7 +87,7 @@ def lateral_shift_m(
 
 @lru_cache(maxsize=1)
 def rotations() -> NDArray[np.float64]:
-    """The rotations (ROTATIONS, 2): yaw to the left and pitch down, rad; the first is none."""
+    """All rotations (ROTATIONS, 2): yaw to the left and pitch downwards, rad; number 0 is none."""
     rng = np.random.default_rng(0)
     # Quantiles of the normal distribution rather than draws: few values represent it well.
     quantiles = (np.arange(1, ROTATIONS) - 0.5) / (ROTATIONS - 1)
@@ -107,7 +108,7 @@ def rotate(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> N
 def rotation_maps(
     camera: CameraParameters, number: int
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Source pixel of each pixel of a rotated image, as OpenCV's fixed-point maps."""
+    """Source pixel of each pixel of a rotated image, as fixed-point maps of OpenCV."""
     inverse = np.linalg.inv(rotation_homography(camera, *rotations()[number].tolist()))
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y, scale = np.tensordot(inverse, np.stack([columns, rows, np.ones_like(rows)]), 1)
@@ -119,7 +120,8 @@ def rotation_maps(
 def rotation_homography(
     camera: CameraParameters, yaw: float, pitch: float = 0.0
 ) -> NDArray[np.float64]:
-    """Homography (3, 3) of pixels when the car turns left by `yaw`, the camera down by `pitch`."""
+    """Homography (3, 3) of pixels for a car rotated left by `yaw` and a camera tilted down by
+    `pitch`."""
     return camera.homography(
         replace(
             camera,
@@ -135,9 +137,9 @@ def rotate_labels(
     yaw: NDArray[np.float64],
     camera: CameraParameters,
 ) -> NDArray[np.float32]:
-    """Coded targets (B, 6) after the car turned left by `yaw` (B,) about its camera.
+    """Coded targets (B, 6) after the car rotated left by `yaw` (B,) about its camera.
 
-    Its centre of gravity, `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
+    The centre of gravity, `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
     """
     shift = -camera.x * np.sin(yaw)
     return tf.encode(distances + shift[:, None], angle - yaw)

@@ -1,8 +1,8 @@
-"""Augmentation of `mtlnet.data.augment.pipeline` by torch, on a whole batch: for a GPU.
+"""The augmentation of `mtlnet.data.augment.pipeline` in torch, on a whole batch, for a GPU.
 
-Drawn as there, with the same labels. What differs: shift, rotation and mirroring are one sampling,
-so that a pixel is interpolated once; levels are rounded once, at the end; noise is drawn anew; and
-no image is written as JPEG.
+The parameters and labels are the same. Differences: shift, rotation and mirroring are one
+resampling, so that each pixel is interpolated once; pixel values are rounded once, at the end;
+noise is drawn anew; there is no JPEG compression.
 """
 
 from functools import lru_cache
@@ -29,10 +29,10 @@ BLUR_RADIUS = 3
 
 
 def to_device(values: NDArray[Any], device: torch.device) -> Tensor:
-    """An array as a tensor on `device`.
+    """The array as a tensor on `device`.
 
-    To a GPU it is copied from pinned memory: a copy from other memory may wait for the kernels that
-    are queued, and the GPU would then idle while the next batch is made.
+    It is copied to a GPU from pinned memory. A copy from other memory may wait for the kernels in
+    the queue, and the GPU would then idle while the next batch is made.
     """
     tensor = torch.from_numpy(values)
     if device.type == "cuda":
@@ -41,7 +41,7 @@ def to_device(values: NDArray[Any], device: torch.device) -> Tensor:
 
 
 class DeviceAugment:
-    """AugmentParams images whose rows above `first_row` are missing, on `device`."""
+    """Applies AugmentParams on `device` to images without the rows above `first_row`."""
 
     def __init__(self, camera: CameraParameters, first_row: int, device: torch.device) -> None:
         self._camera = camera
@@ -56,7 +56,7 @@ class DeviceAugment:
         )
 
     def __call__(self, images: Tensor, params: AugmentParams, seed: int) -> Tensor:
-        """Changed images (B, h, W, 3) uint8; `seed`: of the noise."""
+        """Augmented images uint8 (B, h, W, 3); `seed` is that of the noise."""
         x = images.permute(0, 3, 1, 2).float()
         x = self._moved(x, params)
         shade = self._shades.index_select(0, self._on(params.shadow)).permute(0, 3, 1, 2)
@@ -73,7 +73,7 @@ class DeviceAugment:
         return to_device(values, self._device)
 
     def _moved(self, x: Tensor, params: AugmentParams) -> Tensor:
-        """Moved aside, turned and mirrored: each pixel from where it was, in one step."""
+        """Shifted, rotated and mirrored images; each pixel is resampled once."""
         _, _, height, width = x.shape
         rows = torch.arange(height, device=x.device, dtype=torch.float32) + self._first_row
         columns = torch.arange(width, device=x.device, dtype=torch.float32)
@@ -90,7 +90,7 @@ class DeviceAugment:
             [2 * u / (width - 1) - 1, 2 * (v - self._first_row) / (height - 1) - 1], 3
         )
         moved = grid_sample(x, grid, "bilinear", "reflection", align_corners=True)
-        # What comes into view beside a moved road is bare: mirrored, a marking would turn round.
+        # The area that comes into view is filled without markings: mirrored ones would bend back.
         bare = x[:, :, -1].mean(2)[:, :, None, None]
         beside = (metres != 0) & ((u < -0.5) | (u > width - 0.5))
         return torch.where(beside[:, None], bare, moved)
@@ -143,7 +143,7 @@ class DeviceAugment:
 
 @lru_cache(maxsize=4096)
 def blur_kernel(deviation_px: float) -> NDArray[np.float32]:
-    """A normal distribution's weights (2 BLUR_RADIUS + 1,), cut off where OpenCV's blur is."""
+    """Weights (2 BLUR_RADIUS + 1,) of a normal distribution, truncated as in OpenCV's blur."""
     away = np.arange(-BLUR_RADIUS, BLUR_RADIUS + 1)
     weight = np.exp(-0.5 * (away / deviation_px) ** 2) * (np.abs(away) <= round(2 * deviation_px))
     kernel: NDArray[np.float32] = (weight / weight.sum()).astype(np.float32)

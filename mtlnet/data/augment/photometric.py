@@ -1,8 +1,8 @@
 """Augmentation of colour and image quality: colour, blur, noise, JPEG artefacts.
 
-Images are uint8 RGB (H, W, 3), changed in place by OpenCV. The operations are defined as in
-torchvision.transforms.v2 (tests/mtlnet/data/test_augment.py compares them), which takes 3 to 30
-times as long.
+Images are uint8 RGB (H, W, 3), changed in place with OpenCV. The operations are those of
+torchvision.transforms.v2, which take 3 to 30 times as long; tests/mtlnet/data/test_augment.py
+compares the results.
 """
 
 from functools import lru_cache
@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 BRIGHTNESS, CONTRAST, SATURATION = 0.12, 0.15, 0.2
 CHANNEL_BRIGHTNESS, CHANNEL_CONTRAST = 0.04, 0.06  # drawn for each channel
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
-STORED_NOISE_STD = 32.0  # of the stored noise, whose mean is 128
+STORED_NOISE_STD = 32.0  # standard deviation of the stored noise; its mean is 128
 
 
 def draw_colour_transforms(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Random affine colour transforms (B, 3, 4), from (r, g, b, 1) to (r, g, b), 0 to 255.
 
-    Saturation, then contrast about the middle grey and brightness, both also by channel.
+    In order: saturation; contrast about middle grey and brightness, for all channels and per
+    channel.
     """
     saturation = 1.0 + rng.uniform(-SATURATION, SATURATION, (count, 1, 1))
     mixed = saturation * np.eye(3) + (1.0 - saturation) * np.array(LUMA)
@@ -36,13 +37,14 @@ def draw_colour_transforms(count: int, rng: np.random.Generator) -> NDArray[np.f
 
 
 def blur(image: NDArray[np.uint8], std_px: float) -> None:
-    """Gaussian blur with a standard deviation in px."""
+    """Blur the image by a Gaussian with a standard deviation in px."""
     side = 2 * round(2 * std_px) + 1
     cv2.GaussianBlur(image, (side, side), std_px, dst=image)
 
 
 def add_noise(image: NDArray[np.uint8], std: float, start: int) -> None:
-    """Add normal noise of standard deviation `std` (0 to 255), from `start` in a stored array."""
+    """Add stored normal noise, starting at index `start`, with standard deviation `std` (0 to
+    255)."""
     noise = stored_noise(2 * image.size)[start : start + image.size].reshape(image.shape)
     weight = std / STORED_NOISE_STD
     cv2.addWeighted(image, 1.0, noise, weight, -128.0 * weight, dst=image)
@@ -50,12 +52,13 @@ def add_noise(image: NDArray[np.uint8], std: float, start: int) -> None:
 
 @lru_cache(maxsize=2)
 def stored_noise(size: int) -> NDArray[np.uint8]:
-    """Normal noise (size,) about 128; drawing it for each image would take most of the time."""
+    """Normal noise (size,) about 128, stored because drawing it per image would dominate the
+    time."""
     drawn = np.random.default_rng(0).standard_normal(size, np.float32)
     return (128 + STORED_NOISE_STD * drawn).round().clip(0, 255).astype(np.uint8)
 
 
 def compress(image: NDArray[np.uint8], quality: int) -> None:
-    """Encode the image as a JPEG and decode it again."""
+    """Compress the image as JPEG and decode it again."""
     file = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality, "RGB", "420")
     simplejpeg.decode_jpeg(file, "RGB", buffer=image)

@@ -1,8 +1,8 @@
-"""Augmentation of a batch: draw the parameters, apply them to images, and change the labels.
+"""Augmentation of a batch: draw the parameters, apply them to images, change the labels.
 
-The parameters of a whole batch are drawn from one generator before any image is changed: a process
-that makes only some of the batch's images changes them as one that makes all. Images are uint8
-(H, W, 3), changed in place.
+The parameters of a whole batch are drawn from one generator before any image is changed. A process
+that makes only a part of the batch therefore changes its images like a process that makes all.
+Images are uint8 (H, W, 3), changed in place.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -25,26 +25,26 @@ from mtlnet.data.augment.shadows import SHADOWS, add_shadow
 from mtlnet.inference.rectification import BORDER_LEVEL, LEAST_SHOWN
 from trackfeatures.camera import CameraParameters
 
-# Shares of the images. Small: in a run of an hour the network sees each frame about five times, and
-# with twice these shares its errors were larger, on its own test frames as well as on others.
+# Shares of augmented images. They are small, because a network sees each frame only about five
+# times in an hour of training; with twice these shares its errors on all test frames were larger.
 SHIFT_SHARE, ROTATION_SHARE, SHADOW_SHARE, PATCH_SHARE = 0.3, 0.3, 0.15, 0.125
 BLUR_SHARE, NOISE_SHARE, JPEG_SHARE = 0.08, 0.12, 0.0625
 BORDER_SHARE = 0.5
 MAX_BORDER = (0.3, 0.3, 0.25, 0.25)
-"""Shares of rows and columns without a picture at the top, bottom, left and right, at most."""
+"""Maximum shares of rows and columns without a picture at the top, bottom, left and right."""
 NARROW_SHARE = 0.15
-"""Of the images: with a border like that of a lens that shows as little as can be answered."""
+"""Share of images with the border of the narrowest lens that the model still answers for."""
 LOWEST_EDGE = 0.55
-"""Share of the rows at which such a picture ends at the earliest: it shows some road."""
+"""Least share of the rows above the lower border of such an image, so that it shows some road."""
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
 
 @dataclass(frozen=True)
 class AugmentParams:
-    """Parameters for each of B images; 0 leaves an image unchanged."""
+    """Augmentation parameters of B images; 0 leaves an image unchanged."""
 
-    shift: NDArray[np.float64]  # (B,) m to the left; as drawn: share of the possible shift
+    shift: NDArray[np.float64]  # (B,) m to the left; before `resolve_lateral_shift` a share
     rotation: NDArray[np.int64]  # (B,) number of one of `ROTATIONS`
     mirrored: NDArray[np.bool_]  # (B,)
     shadow: NDArray[np.int64]  # (B,) number of one of `SHADOWS`
@@ -57,12 +57,12 @@ class AugmentParams:
     border: NDArray[np.int64]  # (B, 4) px without a picture at the top, bottom, left, right
 
     def take(self, rows: slice) -> "AugmentParams":
-        """Those of some of the images."""
+        """The parameters of the images in `rows`."""
         return AugmentParams(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def draw_params(count: int, height: int, width: int, rng: np.random.Generator) -> AugmentParams:
-    """Draw the parameters of a batch; `resolve_lateral_shift` must follow before applying them."""
+    """Draw the parameters of a batch; call `resolve_lateral_shift` before applying them."""
     return AugmentParams(
         shift=rng.uniform(-1.0, 1.0, count) * (rng.random(count) < SHIFT_SHARE),
         rotation=rng.integers(1, ROTATIONS, count) * (rng.random(count) < ROTATION_SHARE),
@@ -90,7 +90,7 @@ def _draw_patch(count: int, height: int, width: int, rng: np.random.Generator) -
 def _draw_border(
     count: int, height: int, width: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Borders (B, 4) px that a camera with a narrower field of view does not show."""
+    """Borders (B, 4), px, outside the field of view of a narrower camera."""
     share = rng.uniform(0.0, MAX_BORDER, (count, 4)) * (rng.random((count, 1)) < BORDER_SHARE)
     shown = rng.uniform(LEAST_SHOWN, 1.0, (count, 2))  # of rows and columns
     first = np.column_stack([np.maximum(LOWEST_EDGE - shown[:, 0], 0.0), np.zeros(count)])
@@ -108,7 +108,7 @@ def resolve_lateral_shift(params: AugmentParams, distances: NDArray[np.float32])
 def apply_params(
     images: NDArray[np.uint8], params: AugmentParams, camera: CameraParameters
 ) -> None:
-    """Change images (B, H, W, 3) in the order of image formation: scene, light, lens, file."""
+    """Augment images (B, H, W, 3) in the order of image formation: scene, light, lens, file."""
     for row, image in enumerate(images):
         if params.shift[row]:
             shift_lateral(image, camera, float(params.shift[row]))
@@ -131,7 +131,7 @@ def apply_params(
 
 
 def _clear_border(image: NDArray[np.uint8], border: list[int]) -> None:
-    """Fill the border (top, bottom, left, right) of an image, px, in place."""
+    """Fill the border (top, bottom, left, right; px) of an image, in place."""
     top, bottom, left, right = border
     image[:top] = BORDER_LEVEL
     image[image.shape[0] - bottom :] = BORDER_LEVEL
@@ -146,7 +146,7 @@ def augment_labels(
     params: AugmentParams,
     camera: CameraParameters,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Coded targets (B, 6) and classes (B,) of the changed images."""
+    """Coded targets (B, 6) and classes (B,) of the augmented images."""
     shift = (params.shift * np.cos(angle)).astype(np.float32)
     yaw = rotations()[params.rotation, 0]
     coded = rotate_labels(distances + shift[:, None], angle, yaw, camera)

@@ -1,4 +1,4 @@
-"""Augmentation by shadows of trees on the road, drawn once and used again.
+"""Augmentation by shadows of trees on the road; each shadow is drawn once and reused.
 
 A network trained on few shaded places mistakes the edges of shadows for markings.
 """
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from trackfeatures.camera import CameraParameters
 
-SHADOWS = 64  # shadows to choose from; number 0 is none
+SHADOWS = 64  # number of shadows; number 0 is none
 DARKNESS = (0.3, 0.75)  # share of the light that a shadow removes
 COVERED = (0.15, 0.7)  # share of the road that is shaded
-CELL_M = 0.08  # of the noise field from which shadows are cut
+CELL_M = 0.08  # size of a cell of the noise field from which shadows are cut
 LEAF_CELLS, CROWN_CELLS = 3.0, 14.0  # standard deviations of the blur: leaves, crowns
 MAX_DISTANCE_M = 40.0  # beyond it a shadow is uniform
-FIELD = 1024  # cells a side
+FIELD = 1024  # cells per side
 
 
 def add_shadow(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> None:
@@ -28,13 +28,13 @@ def add_shadow(image: NDArray[np.uint8], camera: CameraParameters, number: int) 
 
 
 def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
-    """Remaining light (SHADOWS, H, W, 3), 255 where there is no shadow."""
+    """Remaining light (SHADOWS, H, W, 3) of all shadows; 255 where there is no shadow."""
     return np.stack([shadow_mask(camera, number) for number in range(SHADOWS)])
 
 
 @lru_cache(maxsize=2 * SHADOWS)
 def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
-    """Remaining light (H, W, 3) of one shadow, made when it is first asked for: all take 6 s."""
+    """Remaining light (H, W, 3) of one shadow, computed on first use (all shadows take 6 s)."""
     if number == 0:
         return np.full((camera.height, camera.width, 3), 255, np.uint8)
     rng = np.random.default_rng()
@@ -55,7 +55,7 @@ def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=2)
 def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Point of a flat road that each pixel shows, (H, W) each: m ahead, m left of the camera.
+    """The point of a flat road in each pixel, two arrays (H, W): m ahead and m left of the camera.
 
     Pixels above the horizon or far away are more than `MAX_DISTANCE_M` ahead.
     """
@@ -70,7 +70,7 @@ def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[
 
 @dataclass(frozen=True)
 class Drawn:
-    """The random numbers of a shadow."""
+    """Random numbers of one shadow."""
 
     noise: NDArray[np.float32]  # (FIELD, FIELD)
     leaves: float  # weight of the leaves; that of the crowns is 1
@@ -90,7 +90,7 @@ def _draw(rng: np.random.Generator) -> Drawn:
 
 @lru_cache(maxsize=SHADOWS)
 def _state_before(number: int) -> Any:
-    """The generator's state once the shadows before `number` are drawn: one generator draws all."""
+    """State of the generator after the shadows before `number`; one generator draws all shadows."""
     rng = np.random.default_rng(0)
     if number > 1:
         rng.bit_generator.state = _state_before(number - 1)

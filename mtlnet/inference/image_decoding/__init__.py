@@ -1,1 +1,2 @@
-"""Decoding images from untrusted sources: structure and limits are checked before pixels."""
+"""Decoding of images from untrusted sources: structure and limits are checked before pixels are
+decoded."""

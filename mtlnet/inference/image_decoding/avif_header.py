@@ -1,6 +1,6 @@
 """Size and orientation of an AVIF, from the properties of its primary item.
 
-Sources: ISO/IEC 14496-12 (boxes), 23008-12 (HEIF), 23000-22 (MIAF: `irot` turns, then `imir`
+Sources: ISO/IEC 14496-12 (boxes), 23008-12 (HEIF), 23000-22 (MIAF: `irot` rotates, then `imir`
 mirrors; an orientation in EXIF is ignored).
 """
 
@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
-# The orientation (as in EXIF) of a mirroring (none, top with bottom, left with right) after a turn
-# anticlockwise by 0, 90, 180 or 270 degrees.
+# Orientation (as in EXIF) by mirroring (none, vertical, horizontal) after an anticlockwise rotation
+# by 0, 90, 180 or 270 degrees.
 ORIENTATIONS = {None: (1, 8, 3, 6), 0: (4, 5, 2, 7), 1: (2, 7, 4, 5)}
 MAX_BOXES = 10_000
 
@@ -36,7 +36,7 @@ def _primary(body: memoryview) -> tuple[int, int, int]:
 
 
 def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """(type, content) of the boxes in `data`."""
+    """Type and content of each box in `data`."""
     at = 0
     for _ in range(MAX_BOXES):
         if at + 8 > len(data):
@@ -52,7 +52,7 @@ def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _associations(ipma: memoryview, item: int) -> list[int]:
-    """Numbers, from 1, of the properties of an item; 0: none."""
+    """Numbers, from 1, of the properties of an item; 0: no property."""
     id_bytes, step = 4 if ipma[0] else 2, 2 if ipma[3] & 1 else 1
     at = 8
     for _ in range(min(_number(ipma, 4, 4), MAX_BOXES)):

@@ -1,8 +1,8 @@
 """The part of an image that shows the field of view of the model's camera (pinhole, centred).
 
-A model was trained with one camera: a stretched image, or one of another field of view, would give
-wrong distances and angles without any error. So a wider image is cropped to the camera's field of
-view, and a narrower one is refused.
+A model is trained with one camera: a stretched image, or one of another field of view, would give
+wrong distances and angles without any error message. So a wider image is cropped to the camera's
+field of view, and a narrower one is refused.
 """
 
 from dataclasses import dataclass
@@ -27,10 +27,10 @@ class Box:
 def crop_box(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None = None
 ) -> Box | None:
-    """The part of a width x height image that `view` shows; None: all of it.
+    """The part of a width x height image that `view` shows; None: the whole image.
 
-    `fov_y_deg` is the vertical field of view of the image, None: that of `view`. A pinhole camera
-    of focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less than
+    `fov_y_deg`: vertical field of view of the image; None: that of `view`. A pinhole camera of
+    focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less than
     `view`.
     """
     ratio = 1.0

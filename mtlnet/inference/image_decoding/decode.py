@@ -1,13 +1,14 @@
-"""From an image file's bytes to the model's input: limits, header, strict decoding, scaling.
+"""Decodes image files to the model's input: limits, header, strict decoding, scaling.
 
-Used by `mtlnet predict`, `train`, `evaluate` and `serve`, which so get the same pixels. The size is
-read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is turned upright as
-its orientation says (EXIF, of a PNG `eXIf`); every size and crop is of the upright image. A wider
-image is cropped to the model's field of view (`mtlnet.inference.image_decoding.crop`). Alpha is
-dropped, grey becomes RGB, 16 bits become 8.
+Used by `mtlnet predict`, `train`, `evaluate` and `serve`, so that all get the same pixels. The size
+is read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is rotated
+upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop is that of the upright
+image. A wider image is cropped to the model's field of view
+(`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, 16 bits are reduced to
+8.
 
-A service takes JPEG and PNG (`inspect`, `decode`). A file of this machine may be of another kind
-and is under no limits but that of memory (`read_image`, `read_whole_image`, `decode_file`).
+A service accepts JPEG and PNG (`inspect`, `decode`). A file on this machine may be of another kind
+and is limited only by memory (`read_image`, `read_whole_image`, `decode_file`).
 """
 
 from collections.abc import Iterator
@@ -35,23 +36,24 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 MAX_FILE_BYTES = 1 << 30
-MAX_FILE_PIXELS = 256_000_000  # of a file of this machine: 0.8 GB; the largest sensors have 200
+MAX_FILE_PIXELS = 256_000_000  # in a file of this machine: 0.8 GB; the largest sensors have 200
 MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
 MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the largest image
-LATE_CHECK_BYTES = 1 << 18  # a JPEG file of more is checked when it is decoded, not by `inspect`
-# One 2.6 GHz core: a PNG of 64 bits a pixel 84 ns a pixel, a baseline JPEG 10, of ten scans 15.
+LATE_CHECK_BYTES = 1 << 18  # larger JPEG files are checked by `decode`
+# On one core at 2.6 GHz: 84 ns per pixel of a PNG with 64 bits per pixel, 10 of a baseline JPEG, 15
+# of one with ten scans.
 PNG_NS_PER_BIT, PNG_NS_PER_BYTE, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 2.0, 10.0, 1.0, 10
-TURN_NS = 6.0  # to turn a pixel upright
+TURN_NS = 6.0  # time to rotate a pixel
 MAX_SEQUENTIAL_SCANS = 4  # one for each component
 MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
 
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """Size of an upright image, px; `png_header` is set for a PNG.
+    """Size of the upright image, px; `png_header` is set for a PNG.
 
-    `scans`: of a JPEG; where it was not `checked`, the usual number of such a JPEG. `orientation`:
-    how it must be turned to stand upright, as in EXIF.
+    `scans`: number of scans of a JPEG, or the usual number of such a JPEG if it was not `checked`.
+    `orientation`: as in EXIF.
     """
 
     width: int
@@ -63,7 +65,7 @@ class ImageHeader:
 
     @property
     def decode_ms(self) -> float:
-        """An estimate of the time to decode it on one core, ms."""
+        """Estimated time to decode it on one core, ms."""
         if (found := self.png_header) is not None:
             per_pixel_ns = PNG_NS_PER_BIT * max(8, found.pixel_bits)
             per_pixel_ns += PNG_NS_PER_BYTE * found.file_bytes / (self.width * self.height)
@@ -79,8 +81,8 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """The image file at `path` as uint8 RGB (view.height, view.width, 3).
 
-    It is scaled, and cropped if wider than the view; `fov_y_deg` as in `inspect`. Raises ImageError
-    for an image that cannot be used, UserError for a missing or too large file.
+    It is scaled, and cropped if it is wider than the view; `fov_y_deg` as in `inspect`. Raises
+    ImageError for an image that cannot be used, UserError for a file that is missing or too large.
     """
     with _named(path):
         return crop_and_resize(decode_file(_read_file(path)), view, fov_y_deg)
@@ -94,7 +96,7 @@ def read_whole_image(path: Path) -> NDArray[np.uint8]:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Names the file in an ImageError."""
+    """Add the file's name to an ImageError."""
     try:
         yield
     except ImageError as error:
@@ -113,7 +115,7 @@ def _read_file(path: Path) -> bytes:
 
 
 def decode_file(body: bytes) -> NDArray[np.uint8]:
-    """The image in a file or recording of this machine, uint8 RGB, upright (H, W, 3).
+    """The image in a file or recording of this machine: uint8 RGB, upright (H, W, 3).
 
     Raises ImageError.
     """
@@ -149,9 +151,9 @@ def check_file_size(width: int, height: int) -> None:
 def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None) -> ImageHeader:
     """The header of an image, checked against all limits before decoding.
 
-    Takes a few ms at most: what takes longer is left to `decode`.
+    Takes a few ms at most; slower checks are left to `decode`.
 
-    `fov_y_deg`: the image's vertical field of view, None: that of `view`. Raises ImageError.
+    `fov_y_deg`: vertical field of view of the image; None: that of `view`. Raises ImageError.
     """
     header = read_header(body)
     crop_box(header.width, header.height, view, fov_y_deg)
@@ -159,8 +161,8 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
 
 
 def read_header(body: bytes) -> ImageHeader:
-    """The header of an image, checked against the limits that hold for every camera; as `inspect`
-    otherwise. Raises ImageError."""
+    """The header of an image, checked against the limits of every camera; otherwise as `inspect`.
+    Raises ImageError."""
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
         orientation = exif_orientation(png.find_exif(body))
@@ -183,7 +185,7 @@ def _upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
 
 def _inspect_jpeg(body: bytes) -> ImageHeader:
     is_large = len(body) > LATE_CHECK_BYTES
-    # First, as the decoder's reader would take 20 ms over many segments or a large colour profile.
+    # First, because the decoder may take 20 ms for many segments or a large colour profile.
     head = jpeg.read_head(body) if is_large else None
     width, height, colours = _jpeg_size(body if head is None else head.description)
     if colours not in ("Gray", "YCbCr", "RGB"):
@@ -199,7 +201,7 @@ def _inspect_jpeg(body: bytes) -> ImageHeader:
 
 
 def _jpeg_size(body: bytes) -> tuple[int, int, str]:
-    """Width and height as stored, px, and the colours. Raises ImageError."""
+    """Stored width and height, px, and colour space. Raises ImageError."""
     try:
         # The decoder's own header reader, so that sizes cannot differ from the decoded image.
         height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
@@ -209,7 +211,7 @@ def _jpeg_size(body: bytes) -> tuple[int, int, str]:
 
 
 def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
-    """The structure of a JPEG, if it is sound. Raises ImageError."""
+    """The structure of a JPEG, after checks. Raises ImageError."""
     structure = jpeg.read_structure(body)
     check_trailing(len(body) - structure.length)
     if structure.scans * width * height > MAX_SCANNED_PX:
@@ -222,7 +224,8 @@ def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
 
 
 def _check_late(body: bytes, header: ImageHeader) -> None:
-    """Check what `inspect` left. Raises ImageError, also where the estimate was too low."""
+    """Make the checks that `inspect` left out. Raises ImageError, also where its estimate was too
+    low."""
     scans = _check_jpeg(body, header.width, header.height).scans
     if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
         raise ImageError(
@@ -256,7 +259,7 @@ def check_size(width: int, height: int) -> None:
 def decode(
     body: bytes, header: ImageHeader, view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
-    """The image as uint8 RGB (view.height, view.width, 3), cropped and area-averaged to it.
+    """The image as uint8 RGB (view.height, view.width, 3), cropped to the view and area-averaged.
 
     `header` and `fov_y_deg` as in `inspect`. Raises ImageError.
     """
@@ -304,7 +307,7 @@ def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
-    """As `_decode_jpeg`, also where a webcam's driver put zeros before the end marker."""
+    """As `_decode_jpeg`, also where a webcam's driver wrote zeros before the end marker."""
     try:
         return _decode_jpeg(body)
     except ImageError:
@@ -315,7 +318,8 @@ def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_png(body: bytes, header: png.PngHeader, *, limited: bool = True) -> NDArray[np.uint8]:
-    """`limited`: refuse very many chunks, and bytes behind the image. Raises ImageError."""
+    """Pixels of a PNG. `limited`: refuse too many chunks, and bytes after the image. Raises
+    ImageError."""
     checked, end = png.critical_chunks(body, header, limited=limited)
     if limited:
         check_trailing(len(body) - end)

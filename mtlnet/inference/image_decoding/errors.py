@@ -1,4 +1,4 @@
-"""The error for an image that cannot be used, with a kind that `serve` maps to HTTP."""
+"""The error for an image that cannot be used, with a kind that `serve` maps to an HTTP status."""
 
 from enum import StrEnum
 
@@ -18,7 +18,7 @@ class Fault(StrEnum):
 
 
 class ImageError(UserError):
-    """An image that this model cannot use; `fault` is the kind of reason."""
+    """The model cannot use the image; `fault` is the kind of reason."""
 
     def __init__(self, fault: Fault, message: str) -> None:
         super().__init__(message)

@@ -1,7 +1,8 @@
 """The structure of a JPEG, read before decoding: its end, number of scans and orientation.
 
 Sources: ITU-T T.81, annex B; CIPA DC-008 (Exif 3.0). The decoder stops at the end marker and
-ignores what follows; here the end is found, so that a file appended to the image is detected.
+ignores the following bytes; the end is determined here, so that a file appended to the image is
+detected.
 """
 
 import re
@@ -17,22 +18,22 @@ SIGNATURE = b"\xff\xd8\xff"
 END = b"\xff\xd9"
 SOS, EOI, APP0, APP1, APP14 = 0xDA, 0xD9, 0xE0, 0xE1, 0xEE
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
-DESCRIBING = FRAMES | {SOS, EOI, APP0, APP14}  # all that say size and colours
+DESCRIBING = FRAMES | {SOS, EOI, APP0, APP14}  # all that state size and colours
 PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
 # In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
 ENDS_DATA = np.ones(256, np.bool_)
 ENDS_DATA[[0x00, *range(0xD0, 0xD8), 0xFF]] = False
 MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
 MAX_SEGMENTS = 1_000
-WINDOW_BYTES = 1 << 18  # searched at once; between two searches other threads may run
-FIRST_BYTES = 1 << 16  # searched first, in the quickest way for most images
+WINDOW_BYTES = 1 << 18  # searched at once; other threads can run between two searches
+FIRST_BYTES = 1 << 16  # searched first, which is fastest for most images
 FILL = re.compile(rb"\xff+")
 END_OF_DATA = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # as `ENDS_DATA`
 
 
 @dataclass(frozen=True, slots=True)
 class JpegStructure:
-    """Length of a JPEG with its end marker, bytes, the number of its scans and its orientation."""
+    """Length of a JPEG including its end marker, bytes; number of scans; orientation."""
 
     length: int
     scans: int
@@ -41,9 +42,9 @@ class JpegStructure:
 
 @dataclass(frozen=True, slots=True)
 class JpegHead:
-    """What stands before the first scan: whether it is progressive, and the orientation, 1 to 8.
+    """The part before the first scan: whether the JPEG is progressive, and its orientation, 1 to 8.
 
-    `description` is a JPEG of the segments alone that say its size and colours, up to that scan.
+    `description`: a JPEG with only the segments before that scan that state size and colours.
     """
 
     is_progressive: bool
@@ -52,7 +53,7 @@ class JpegHead:
 
 
 def read_head(body: bytes) -> JpegHead:
-    """What stands before the first scan. Raises ImageError. Takes 3 ms at worst."""
+    """The part before the first scan; takes at most 3 ms. Raises ImageError."""
     at, frame, exif, kept = len(START), 0, None, [START]
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
@@ -73,7 +74,7 @@ def read_head(body: bytes) -> JpegHead:
 def read_structure(body: bytes) -> JpegStructure:
     """The structure of the JPEG at the start of `body`. Raises ImageError.
 
-    Takes 3 ms a MiB at worst; up to WINDOW_BYTES of that in one step.
+    Takes at most 3 ms per MiB, in steps of up to WINDOW_BYTES.
     """
     at, scans, exif = len(START), 0, None
     for _ in range(MAX_SEGMENTS):
@@ -96,7 +97,7 @@ def read_structure(body: bytes) -> JpegStructure:
 
 
 def _marker(body: bytes, at: int) -> tuple[int, int]:
-    """(Offset after the marker at offset `at`, the marker's code)."""
+    """Offset after the marker at offset `at`, and the marker's code."""
     if at + 2 > len(body):
         raise _ends_early(body)
     if body[at] != 0xFF:
@@ -117,9 +118,9 @@ def _find_marker(body: bytes, at: int) -> int:
     first = END_OF_DATA.search(body, at, at + FIRST_BYTES)
     if first is not None:
         return first.start()
-    # One byte again: a marker may lie on both sides of the end of what was searched.
+    # One byte again: a marker may cross the end of the searched part.
     for start in range(at + FIRST_BYTES - 1, len(body), WINDOW_BYTES):
-        # One byte more: a marker may lie on both sides of the end of a window.
+        # One byte more: a marker may cross the end of a window.
         count = min(WINDOW_BYTES + 1, len(body) - start)
         window = np.frombuffer(body, np.uint8, count, start)
         escapes = np.flatnonzero(window[:-1] == 0xFF)
@@ -137,7 +138,7 @@ def _length(body: bytes, at: int) -> int:
 
 
 def _exif(body: bytes, at: int, length: int) -> bytes | None:
-    """The Exif block in an APP1 segment, whose length lies at offset `at`; None: of other use."""
+    """The Exif block in an APP1 segment whose length is at offset `at`; None for other content."""
     is_exif = body.startswith(EXIF_MARK[:-1], at + 2)  # the byte behind the mark is padding
     return body[at + 2 + len(EXIF_MARK) : at + length] if is_exif else None
 

@@ -1,8 +1,7 @@
-"""How an image must be turned to stand upright, as EXIF and TIFF store it in the tag Orientation.
+"""The orientation of an image, stored in the tag Orientation of EXIF and TIFF, and its correction.
 
-Sources: CIPA DC-008 (Exif 3.0), TIFF 6.0, BigTIFF. As in browsers an orientation that is broken or
-impossible counts as none, only the first directory is read (the next is the thumbnail's), and XMP
-is ignored.
+Sources: CIPA DC-008 (Exif 3.0), TIFF 6.0, BigTIFF. As in browsers, a damaged or invalid orientation
+counts as none, only the first directory is read (the next is the thumbnail's), and XMP is ignored.
 """
 
 import struct
@@ -16,28 +15,29 @@ ORIENTATION = 0x0112
 SHORT, LONG = 3, 4
 NONE = 1
 EXIF_MARK = b"Exif\0\0"
-MAX_ENTRIES = 1_000  # read of a directory; they are sorted, and Orientation is among the first
+MAX_ENTRIES = 1_000  # entries read from a directory; they are sorted by tag
 # By version (TIFF, BigTIFF): formats of the number of entries and of an entry (tag, type, count,
-# value); then the format of the first directory's offset, and where it stands.
+# value); format and position of the first directory's offset.
 ENTRIES = {42: ("H", "HHI4s"), 43: ("Q", "HHQ8s")}
 OFFSETS = {42: ("I", 4), 43: ("Q", 8)}
 
 
 def swaps_sides(orientation: int) -> bool:
-    """Whether the upright image is as wide as the stored one is high."""
+    """Whether upright width and height are the stored height and width."""
     return orientation >= 5
 
 
 def exif_orientation(exif: bytes) -> int:
-    """The orientation, 1 to 8, of an Exif block with or without its mark `Exif`."""
+    """The orientation, 1 to 8, in an Exif block with or without its mark `Exif`."""
     kind, value = read_tags(exif.removeprefix(EXIF_MARK)).get(ORIENTATION, (SHORT, NONE))
     return value if kind == SHORT and 1 <= value <= 8 else NONE
 
 
 def read_tags(block: bytes) -> dict[int, tuple[int, int]]:
-    """The first directory of a TIFF block: by tag the type and the value.
+    """The first directory of a TIFF block: type and value by tag.
 
-    The value is -1 where it is not one SHORT or LONG. Of a broken block as much as can be read.
+    The value is -1 where it is not a single SHORT or LONG. From a damaged block, as many tags as
+    can be read.
     """
     order: Literal["little", "big"] = "little" if block.startswith(b"II") else "big"
     version = int.from_bytes(block[2:4], order)
@@ -63,11 +63,11 @@ def read_tags(block: bytes) -> dict[int, tuple[int, int]]:
 
 
 def upright(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """The image (H, W, C) turned and mirrored to stand upright; (W, H, C) where sides are swapped.
+    """The image (H, W, C), rotated and mirrored to be upright; (W, H, C) where sides are swapped.
 
-    `orientation` names the sides of the upright image at which the stored first row and first
-    column lie: 1 top left, 2 top right, 3 bottom right, 4 bottom left, 5 left top, 6 right top,
-    7 right bottom, 8 left bottom.
+    `orientation` names the sides of the upright image where the stored first row and first column
+    are: 1 top left, 2 top right, 3 bottom right, 4 bottom left, 5 left top, 6 right top, 7 right
+    bottom, 8 left bottom.
     """
     if orientation == NONE:
         return image

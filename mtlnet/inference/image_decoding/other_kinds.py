@@ -1,8 +1,9 @@
-"""Image files of this machine that are neither JPEG nor PNG: what OpenCV reads, the rest named.
+"""Image files of this machine other than JPEG and PNG: those that OpenCV reads; the others are
+named.
 
-A file's kind is told by its first bytes, not by its name. Its size is read from its header before
-OpenCV decodes it, which would allocate what the header declares. Of several pictures in a file the
-first is read.
+The kind of a file is determined by its first bytes, not its name. Its size is read from its header
+before OpenCV decodes it, because OpenCV allocates what the header states. If a file has several
+pictures, the first is read.
 """
 
 import re
@@ -27,34 +28,37 @@ SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".apng", ".webp", ".bmp", ".dib"),
     *(".tif", ".tiff", ".avif", ".gif", ".pnm", ".ppm", ".pgm", ".pbm"),
 )
-"""Of the files that are read, in lower case."""
+"""Suffixes of files that are read, in lower case."""
 IMAGE_WIDTH, IMAGE_HEIGHT = 256, 257  # TIFF tags
 NEW_SUBFILE_TYPE, DNG_VERSION = 254, 50706
 REDUCED = 1  # bit of NEW_SUBFILE_TYPE: a smaller copy of another image in the file
-FIRST_BYTES = 1024  # in which the kind of a file shows
+FIRST_BYTES = 1024  # that determine the kind of a file
 
 Header = tuple[int, int, int]
-"""Width and height in px as OpenCV decodes it, and the orientation, 1 to 8, that is then left."""
+"""Width and height in px as decoded by OpenCV, and the orientation, 1 to 8, that remains to be
+corrected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of image file: `signature` matches its first bytes, `suffix` is OpenCV's for it."""
+    """A kind of image file: `signature` matches its first bytes; `suffix` is the one that OpenCV
+    knows."""
 
     name: str
     suffix: str
     signature: re.Pattern[bytes]
     read_header: Callable[[bytes], Header]
-    """Raises ImageError, struct.error or IndexError for a damaged one."""
+    """Reads the header. Raises ImageError, struct.error or IndexError for a damaged one."""
 
 
 def find_kind(body: bytes) -> Kind | None:
-    """The kind of image file that these are the bytes of, None for a kind that is not read."""
+    """The kind of image file that `body` holds; None for a kind that is not read."""
     return next((kind for kind in KINDS if kind.signature.match(body[:FIRST_BYTES])), None)
 
 
 def describe(body: bytes) -> str:
-    """What the bytes are instead of a JPEG or PNG, and what to do about it, for a message."""
+    """What the bytes are instead of a JPEG or PNG, and what to do about it, as text of a
+    message."""
     if (kind := find_kind(body)) is not None:
         return f"a {kind.name} image; {SAVE}"
     first = body[:FIRST_BYTES]
@@ -65,7 +69,7 @@ def describe(body: bytes) -> str:
 
 
 def read_header(body: bytes, kind: Kind) -> Header:
-    """The header of a file of that kind. Raises ImageError."""
+    """The header of a file of this kind. Raises ImageError."""
     try:
         return kind.read_header(body)
     except (struct.error, IndexError):
@@ -94,7 +98,7 @@ def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
 
 
 def _read_webp(body: bytes) -> Header:
-    """RFC 9649: the first chunk is a lossy or lossless picture, or describes the others."""
+    """Source: RFC 9649. The first chunk is a lossy or lossless picture, or describes the others."""
     kind, data = body[12:16], body[20:30]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 6)
@@ -107,7 +111,7 @@ def _read_webp(body: bytes) -> Header:
 
 
 def _riff_chunk(body: bytes, wanted: bytes) -> bytes:
-    """The content of the first chunk of that type, empty without one."""
+    """Content of the first chunk of type `wanted`; empty without one."""
     at = 12
     while at + 8 <= len(body):
         size = int.from_bytes(body[at + 4 : at + 8], "little")
@@ -118,14 +122,14 @@ def _riff_chunk(body: bytes, wanted: bytes) -> bytes:
 
 
 def _read_bmp(body: bytes) -> Header:
-    if body[14] == 12:  # the header of OS/2
+    if body[14] == 12:  # header of OS/2
         return *struct.unpack_from("<HH", body, 18), NONE
     width, height = struct.unpack_from("<ii", body, 18)
-    return abs(width), abs(height), NONE  # a negative height: the first row is the upper one
+    return abs(width), abs(height), NONE  # a negative height: rows are stored from the top
 
 
 def _read_tiff(body: bytes) -> Header:
-    """OpenCV turns a TIFF upright itself, whatever it is asked for."""
+    """Header of a TIFF; OpenCV rotates a TIFF upright itself, whatever the flags."""
     tags = read_tags(body)
     if DNG_VERSION in tags or tags.get(NEW_SUBFILE_TYPE, (0, 0))[1] & REDUCED:
         raise ImageError(

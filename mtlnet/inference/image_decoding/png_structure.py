@@ -1,8 +1,8 @@
 """The structure of a PNG, checked before decoding: header, checksums, amount of pixel data.
 
-Source: PNG specification, third edition (W3C). Decoders differ in the damage they accept and in
-their use of ancillary chunks (orientation, animation, colour profiles). `critical_chunks` checks
-the former and removes the latter; the orientation is read by `find_exif`.
+Source: PNG specification, third edition (W3C). Decoders differ in the damage that they accept and
+in their use of ancillary chunks (orientation, animation, colour profiles). `critical_chunks` checks
+the critical chunks and removes the ancillary ones; the orientation is read by `find_exif`.
 """
 
 import struct
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# Encoders write chunks of 8 KiB or more. Each takes a microsecond to check, however short it is.
+# Encoders write chunks of at least 8 KiB. The check of a chunk takes at least a microsecond.
 FREE_CHUNKS, BYTES_A_CHUNK = 256, 1024
 CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
@@ -31,9 +31,10 @@ FILTERS = 5
 
 @dataclass(frozen=True, slots=True)
 class PngHeader:
-    """IHDR: the size in px, bits a sample, bits a pixel, and whether it is interlaced.
+    """Header of a PNG (IHDR): size in px, bits per sample and per pixel, and whether it is
+    interlaced.
 
-    `file_bytes`: of the whole file, whose checksums are verified.
+    `file_bytes`: size of the whole file, whose checksums are verified.
     """
 
     width: int
@@ -44,7 +45,7 @@ class PngHeader:
     file_bytes: int
 
     def passes(self) -> list[tuple[int, int]]:
-        """(rows, bytes of a row without the filter byte) of each pass."""
+        """Number of rows, and bytes per row without the filter byte, of each pass."""
         steps = PASSES if self.interlaced else ((0, 0, 1, 1),)
         sizes = []
         for column, row, across, down in steps:
@@ -75,9 +76,9 @@ def read_header(body: bytes) -> PngHeader:
 
 
 def find_exif(body: bytes, *, limited: bool = True) -> bytes:
-    """The content of the first `eXIf` chunk, empty without one; its checksum is not verified.
+    """Content of the first `eXIf` chunk; empty without one. Its checksum is not verified.
 
-    `limited`: only among so many chunks as `critical_chunks` allows.
+    `limited`: search only as many chunks as `critical_chunks` allows.
     """
     at = len(SIGNATURE)
     for _ in range(_most_chunks(body, limited)):
@@ -96,9 +97,9 @@ def _most_chunks(body: bytes, limited: bool) -> int:
 
 
 def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> tuple[bytes, int]:
-    """(The PNG with only header, palette and pixel chunks, all checked; its end in `body`).
+    """The PNG reduced to header, palette and pixel chunks, all checked, and its end in `body`.
 
-    `limited`: refuse a PNG of very many chunks. Raises ImageError.
+    `limited`: refuse a PNG with too many chunks. Raises ImageError.
     """
     kept: list[bytes | memoryview] = [SIGNATURE]
     pixels: list[memoryview] = []
@@ -125,7 +126,7 @@ def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> 
 
 
 def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:
-    """(End, type) of the chunk at offset `at`; its checksum is verified."""
+    """End and type of the chunk at offset `at`; its checksum is verified."""
     if at + 12 > len(view):
         raise ImageError(
             Fault.DAMAGED,

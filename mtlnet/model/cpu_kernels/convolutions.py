@@ -1,14 +1,14 @@
-"""Convolutions in the form that a CPU computes fastest: the first one and those of small maps.
+"""Convolutions in forms that a CPU computes fast: the first layer, and those with small maps.
 
-The first, 11 x 11 with stride 4 on 3 colours, becomes 3 x 3 with stride 1 on 48 channels by space
-to depth: a block of 4 x 4 pixels becomes one pixel of 48 channels (row, column, colour). SAME
-padding starts a window 4 rows and 3 columns before its block, so 3 x 3 blocks contain it; the
-kernel is padded to 12 x 12. CPUs compute this three times as fast as with 3 channels. A convolution
-of 12 x 12 with four zeros around the image has that form already.
+The first layer (11 x 11, stride 4, 3 colours) becomes 3 x 3 with stride 1 on 48 channels by space
+to depth: a block of 4 x 4 pixels becomes one pixel with 48 channels (row, column, colour). With
+SAME padding a window starts 4 rows and 3 columns before its block, so 3 x 3 blocks contain it; the
+kernel is padded to 12 x 12. CPUs compute this three times as fast as the form with 3 channels. A
+convolution of 12 x 12 with four zeros around the image has this form already.
 
-The last three have inputs of at most 7 x 9 pixels and most of the weights. There a CPU's
-convolution spends most of its time on reordering weights; one matrix product (im2col), which uses
-the weights as they are stored, takes a sixth of the time.
+The last three layers have inputs of at most 7 x 9 pixels and most of the weights. There a CPU
+spends most of the time of a convolution on reordering weights. One matrix product (im2col) uses the
+weights as they are stored and takes a sixth of the time.
 """
 
 from typing import Any
@@ -17,19 +17,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from mtlnet.model.architecture import same_padding
+from mtlnet.architecture import same_padding
 from mtlnet.model.cpu_kernels.elementwise import as_rows, centre, in_threads
 
 BLOCK = 4
-ROW_BYTES = 12  # of one row of a block: four pixels of three colours
+ROW_BYTES = 12  # bytes of one row of a block: four pixels of three colours
 COLOUR_OFFSET = 127.5
-"""The uint8 value that is normalised to 0; exact in bf16, as are all colours minus it."""
+"""The uint8 value that is normalised to 0. It and all colours minus it are exact in bf16."""
 
 
 def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """uint8 (B, H, W, 3) -> (B, 48, ceil(H / 4), W / 4) channels-last.
+    """Blocks of 4 x 4 px as channels: uint8 (B, H, W, 3) -> (B, 48, ceil(H / 4), W / 4),
+    channels-last.
 
-    Values are colours minus `COLOUR_OFFSET`. Rows below the image are 0. W must be a multiple of 4.
+    Values are colours minus `COLOUR_OFFSET`; rows below the image are 0. W must be a multiple of 4.
     """
     count, height, width, _ = images.shape
     rows, columns, rest = -(-height // BLOCK), width // BLOCK, height % BLOCK
@@ -54,7 +55,7 @@ def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
 def space_to_depth_convolution(
     x: Tensor, weight: Tensor, bias: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
-    """The convolution with `weight` (F, 3, 11, 11), or 12 x 12, of x (B, 48, h, w)."""
+    """Convolution of x (B, 48, h, w) with `weight` (F, 3, 11, 11) or (F, 3, 12, 12)."""
     short = 3 * BLOCK - weight.shape[2]
     kernel = pad(weight * (1 / COLOUR_OFFSET), (short, 0, 0, short))
     filters = len(weight)
@@ -65,7 +66,7 @@ def space_to_depth_convolution(
 
 
 class _Im2colConvolution(torch.autograd.Function):
-    """x (B, H, W, C), weight (F, k, k, C) -> (B, h, w, F), SAME padding."""
+    """Convolution with SAME padding: x (B, H, W, C), weight (F, k, k, C) -> (B, h, w, F)."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, stride: int) -> Tensor:
@@ -101,7 +102,8 @@ class _Im2colConvolution(torch.autograd.Function):
 
 
 def im2col_convolution(x: Tensor, weight: Tensor, stride: int) -> Tensor:
-    """`x` (B, C, H, W) and `weight` (F, C, k, k), both channels-last -> (B, F, h, w), SAME."""
+    """Convolution with SAME padding of x (B, C, H, W) by `weight` (F, C, k, k), both
+    channels-last."""
     out_nhwc = _Im2colConvolution.apply(x.permute(0, 2, 3, 1), weight.permute(0, 2, 3, 1), stride)
     out: Tensor = out_nhwc.permute(0, 3, 1, 2)
     return out

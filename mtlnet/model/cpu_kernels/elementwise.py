@@ -1,9 +1,9 @@
-"""Compiled passes over values (N, C) with channels last: input of the network, batch norm, ReLU.
+"""Compiled passes over channels-last values (N, C): network input, batch normalisation, ReLU.
 
-torch takes several times as long for bf16 with channels last, and more passes. Values are bf16,
-given as uint16, float32 or float64. Parameters of a channel (C,) and what is computed are float32,
-or float64 for values in float64. Sums are in that type over `BLOCK_ROWS` rows and in float64 over
-the blocks. `in_threads` runs a pass on all threads that torch uses.
+For bf16 in channels-last order torch needs more passes and several times as long. Values are bf16
+(given as uint16), float32 or float64. Parameters of a channel (C,) and computed values are float32,
+or float64 for float64 values. Sums are in that type within blocks of `BLOCK_ROWS` rows and in
+float64 over the blocks. `in_threads` runs a pass on all threads of torch.
 """
 
 from collections.abc import Callable
@@ -57,9 +57,9 @@ def _typed_narrow(typing_context: Any, value: Any, like: Any) -> Any:
 
 
 widen: Any = intrinsic(_typed_widen)
-"""A stored value as float32 or float64."""
+"""A stored value converted to float32 or float64."""
 narrow: Any = intrinsic(_typed_narrow)
-"""`narrow(value, like)`: a computed value in the type that the stored value `like` has."""
+"""`narrow(value, like)`: a computed value converted to the type of the stored value `like`."""
 
 
 @compiled_for_threads
@@ -107,9 +107,10 @@ def add_gradient_sums(
     sums: Sums,
     products: Sums,
 ) -> None:
-    """Add to `sums` and `products` (C,) those of g and of g (x - mean).
+    """Add the sums over N of g and of g (x - mean) to `sums` and `products` (C,).
 
-    g: the gradient of a x + b, from `gradient` (N, C), that of relu(a x + b).
+    g is the gradient with respect to a x + b; `gradient` (N, C) is that with respect to relu(a x +
+    b).
     """
     zero = a.dtype.type(0)
     block_sums, block_products = np.zeros_like(a), np.zeros_like(a)
@@ -172,9 +173,10 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def in_threads(work: Callable[[slice, int], None], rows: int) -> None:
-    """Call `work(part, number)` for each of `part_count()` parts of so many rows, each on a thread.
+    """Call `work(part, number)` for each of `part_count()` parts of `rows` rows, each on its own
+    thread.
 
-    Raises what `work` raises.
+    Raises the exceptions of `work`.
     """
     parts = part_count()
     bounds = [rows * number // parts for number in range(parts + 1)]
@@ -190,5 +192,5 @@ def in_threads(work: Callable[[slice, int], None], rows: int) -> None:
 
 
 def part_count() -> int:
-    """The number of threads that torch uses."""
+    """Number of threads that torch uses."""
     return torch.get_num_threads()

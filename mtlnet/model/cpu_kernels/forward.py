@@ -1,6 +1,6 @@
-"""Forward pass of the paper's network in training on a CPU: the same as `Network.forward`, faster.
+"""Forward pass of the network in training on a CPU: the result of `Network.forward`, faster.
 
-It uses the other modules of this folder. In evaluation, and on a GPU, `Network.forward` is used.
+Evaluation and training on a GPU use `Network.forward`.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
-from mtlnet.model.architecture import GRID, GRID_RESIDUAL, HEIGHT, MTL, Conv, Pool, same_padding
+from mtlnet.architecture import GRID, GRID_RESIDUAL, HEIGHT, MTL, Conv, Pool, same_padding
 from mtlnet.model.cpu_kernels.convolutions import (
     im2col_convolution,
     space_to_depth,
@@ -19,17 +19,17 @@ from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, pool_argumen
 from mtlnet.model.network import Network
 
 MAX_IM2COL_PIXELS = 64
-"""Feature maps of at most so many pixels are convolved by `im2col_convolution`."""
+"""Feature maps of at most this many pixels are convolved by `im2col_convolution`."""
 
 
 FAST = (MTL.features, GRID.features, GRID_RESIDUAL.features)
-"""The convolutions that this module has, as `Architecture.features`."""
+"""Architectures (`Architecture.features`) whose convolutions this module implements."""
 
 
 def training_outputs(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Images (B, 210, 280, 3) uint8 -> (B, 9) float32, computed in `dtype`.
+    """Outputs (B, 9) float32 for images uint8 (B, 210, 280, 3), computed in `dtype`.
 
     `masks`: see `forward_features`.
     """
@@ -39,15 +39,15 @@ def training_outputs(
 def forward_features(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """The last shared features (B, 256) of images (B, 210, 280, 3) uint8, in `dtype`.
+    """Last shared features (B, 256) in `dtype` of images uint8 (B, 210, 280, 3).
 
-    `masks`: dropout masks (B, units) of the shared layers, already scaled; none: no dropout.
+    `masks`: scaled dropout masks (B, units) of the shared layers; empty: no dropout.
     """
     return forward_shared(network, forward_grid(network, images, dtype), dtype, masks)
 
 
 def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor:
-    """The last convolution's features (B, C, h, w) of images (B, 210, 280, 3) uint8."""
+    """Features (B, C, h, w) of the last convolution for images uint8 (B, 210, 280, 3)."""
     layers = network.architecture.features
     above = images.shape[1] - HEIGHT + network.architecture.first_row
     x = space_to_depth(images[:, above:], dtype)
@@ -63,7 +63,7 @@ def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor
 def forward_shared(
     network: Network, grid: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """The last shared features (B, 256) of the last convolution's (B, C, h, w)."""
+    """Last shared features (B, 256) of the last convolution's features (B, C, h, w)."""
     x = grid.flatten(1)
     for number in range(len(network.architecture.shared)):
         layer = network.shared.get_submodule(f"fc{number}.layer")
@@ -91,7 +91,7 @@ def _layer(x: Tensor, number: int, spec: Conv, pool: Pool | None, block: nn.Modu
 
 
 def _folded(layer: nn.Conv2d, norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
-    """Filters and biases of a convolution with its normalisation by frozen statistics."""
+    """Filters and biases of a convolution with its frozen batch normalisation folded in."""
     assert norm.running_mean is not None
     assert norm.running_var is not None
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)

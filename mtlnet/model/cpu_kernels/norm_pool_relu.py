@@ -1,6 +1,6 @@
-"""Fused batch normalisation, max pooling and ReLU in training.
+"""Fused batch normalisation, max pooling and ReLU for training.
 
-max(relu(a x + b)) = relu(a max(x) + b) for a >= 0, so pooling comes first and saves three quarters
+max(relu(a x + b)) = relu(a max(x) + b) for a >= 0. So pooling comes first and saves three quarters
 of the work; where a is negative, the caller negates the filter and a. Statistics are those of the
 batch over all processes (Ioffe and Szegedy 2015, algorithm 1).
 """
@@ -13,7 +13,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
-from mtlnet.model.architecture import Pool, same_padding
+from mtlnet.architecture import Pool, same_padding
 from mtlnet.model.cpu_kernels.elementwise import (
     add_affine,
     add_gradient_sums,
@@ -31,7 +31,7 @@ native = torch.ops.aten
 def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
     """Arguments of `max_pool2d` for SAME padding: `padding` before, `ceil_mode` after.
 
-    Before a ReLU it equals the zero padding of `mtlnet.model.network`.
+    Before a ReLU this equals the zero padding of `mtlnet.model.network`.
     """
     before = [same_padding(size, pool.kernel, pool.stride)[1] for size in (height, width)]
     return {
@@ -43,14 +43,14 @@ def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
 
 
 def statistics(x: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Mean (C,), biased variance (C,) and count of values x (B, C, H, W), over all processes.
+    """Mean (C,), biased variance (C,) and number of values x (B, C, H, W), over all processes.
 
-    float32 for x in bf16.
+    The result is float32 for bf16 values.
     """
     values = as_rows(x.detach())
     count = len(values)
     dtype = torch.promote_types(x.dtype, torch.float32)
-    origin = x.detach()[0, :, 0, 0].to(dtype)  # subtracted, so that no digits of the squares cancel
+    origin = x.detach()[0, :, 0, 0].to(dtype)  # subtracted, so that the squares do not cancel
     parts = torch.zeros(part_count(), 2, x.shape[1], dtype=torch.float64)
 
     def work(part: slice, number: int) -> None:
@@ -155,8 +155,8 @@ def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -
 def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
     """Batch normalisation, max pooling and ReLU of x (B, C, H, W).
 
-    x is the convolution's output times `sign` (C,), the sign of the normalisation's gain. Updates
-    the running statistics of `norm` like torch.
+    x is the output of the convolution times `sign` (C,), the sign of the normalisation's gain.
+    Updates the running statistics of `norm` as torch does.
     """
     with torch.no_grad():
         mean, variance, count = statistics(x)

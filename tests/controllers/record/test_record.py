@@ -19,7 +19,8 @@ from datagen.recorder.replay import replay
 from datagen.recording import Dataset, Labels
 from datagen.recording.errors import DatasetError
 from datagen.recording.integrity.verify import verify
-from mtlnet.data.sources import open_training_dataset, recorded_training_data
+from mtlnet.data.rounds import open_training_dataset
+from mtlnet.training.sources import recorded_training_data
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World

@@ -10,11 +10,11 @@ from trackfeatures.camera import CameraParameters
 
 Picture = NDArray[np.uint8]
 BOARD_PX = 60
-"""A square of a board's texture."""
+"""The texture of one square of a board."""
 
 
 def chessboard(columns: int, rows: int) -> Picture:
-    """A texture of a chessboard with so many inner corners and a white rim of one square."""
+    """Texture of a chessboard with this many inner corners and a white border one square wide."""
     squares = np.indices((rows + 1, columns + 1)).sum(axis=0) % 2 == 0
     board = np.where(squares, 0, 255).astype(np.uint8).repeat(BOARD_PX, 0).repeat(BOARD_PX, 1)
     return np.pad(board, BOARD_PX, constant_values=255)
@@ -23,7 +23,7 @@ def chessboard(columns: int, rows: int) -> Picture:
 def board_pictures(
     texture: Picture, lens: CameraParameters, folder: Path, count: int, seed: int
 ) -> list[Path]:
-    """PNG files of the board from random sides, through `lens`."""
+    """PNG files of the board seen through `lens` from random sides."""
     rng = np.random.default_rng(seed)
     rows, columns = np.indices((lens.height, lens.width))
     rays = lens.rays(np.column_stack([columns.ravel(), rows.ravel()]))
@@ -33,7 +33,7 @@ def board_pictures(
         turn = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
         size = np.array([wide, high]) / max(wide, high)
         distance = rng.uniform(1.1, 1.5) * lens.focal_px / lens.width
-        # The middle of the board, whose longer side is 1 m: in turn in all parts of the picture.
+        # Middle of the board, whose longer side is 1 m: it moves through all parts of the picture.
         aside = np.array([0.18 * (number % 3 - 1), 0.11 * (number // 3 % 3 - 1)])
         middle = np.array([*(aside + rng.uniform(-0.03, 0.03, 2)), distance])
         plane = np.column_stack([turn[:, 0], turn[:, 1], middle - turn[:, :2] @ size / 2])
@@ -56,8 +56,8 @@ def board_pictures(
 def road_picture(
     camera: CameraParameters, markings_m: list[float], heading: float = 0.0
 ) -> Picture:
-    """A grey road with white markings 0.12 m wide, `markings_m` to the left of the car, which
-    points `heading` rad to the left of the road."""
+    """A grey road with white markings 0.12 m wide, `markings_m` to the left of a car that points
+    `heading` rad to the left of the road."""
     picture = np.full((camera.height, camera.width, 3), 90, np.uint8)
     ahead = np.linspace(1.0, 90.0, 400)
     c, s = np.cos(heading), np.sin(heading)

@@ -1,4 +1,4 @@
-"""Boards of known lenses are calibrated back."""
+"""Calibrations from pictures of boards through known lenses."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +32,7 @@ def test_a_chessboard_gives_the_lens_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.camera.matrix[:2], LENS.matrix[:2], rtol=0.003)
     np.testing.assert_allclose(found.camera.matrix[2:], LENS.matrix[2:], atol=1.5)
     assert found.camera.coefficients[0] == pytest.approx(-0.25, abs=0.02)
-    # The corners are where the lens shows them, whichever of its numbers share the work.
+    # Corners are compared, because different coefficients can describe the same lens.
     places = np.array([[60.0, 45.0], [420.0, 45.0], [247.0, 173.0], [60.0, 315.0]])
     np.testing.assert_allclose(found.camera.rays(places), LENS.rays(places), atol=0.003)
     assert (found.camera.z, found.camera.pitch_deg) == (MODEL.z, MODEL.pitch_deg)

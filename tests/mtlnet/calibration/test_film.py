@@ -1,4 +1,5 @@
-"""Mounts of drawn drives: straight roads by closed-form projection, with a car that wanders."""
+"""Mounts estimated from drawn drives: straight roads by closed-form projection, with a car that
+sways."""
 
 import math
 from dataclasses import replace
@@ -24,7 +25,7 @@ MOUNTS = [
 def calibrated(
     camera: CameraParameters, pictures: int = 40, lane_m: float | None = LANE_M
 ) -> DriveEstimate:
-    """The estimate from a car that swings 0.4 m to both sides of its lane's middle."""
+    """The estimate from a car that sways 0.4 m to both sides of the middle of its lane."""
     calibration = DriveCalibration(Lens(LENS, 0.0, "given"), lane_m)
     for number in range(pictures):
         time_s = 0.2 * number
@@ -47,7 +48,7 @@ def test_a_drawn_drive_gives_the_mount_back(camera: CameraParameters) -> None:
     assert found.yaw_std_deg < 0.2
     assert found.camera.height_std < 0.02
     assert found.pictures >= 30
-    # What is not looked for stays.
+    # Values that are not estimated stay unchanged.
     assert (found.camera.x, found.camera.y) == (LENS.x, LENS.y)
     assert found.camera.intrinsics() == pytest.approx(LENS.intrinsics())
 

@@ -1,4 +1,4 @@
-"""Where a lens comes from when it is not calibrated."""
+"""The origin of a lens that is not calibrated: given, EXIF, or a guess."""
 
 import math
 import struct

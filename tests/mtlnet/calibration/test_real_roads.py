@@ -1,4 +1,4 @@
-"""The pitch of one real drive, from pictures in a row: judged, never tuned on."""
+"""The pitch of one real drive, from consecutive pictures; nothing was tuned on it."""
 
 from pathlib import Path
 

@@ -23,7 +23,7 @@ def segments(x0: float, y0: float, bend: float, slopes: list[float]) -> Lines:
 def test_a_road_is_found_exactly(bend: float) -> None:
     fit = fit_road(segments(0.03, -0.05, bend, [-1.4, 1.6, 4.6]), 0.01, -0.02)
     assert fit is not None
-    # The prior of the bend is 0.004: a little of it stays.
+    # The prior of the bend is 0.004: the estimate is slightly too small.
     assert fit.x0 == pytest.approx(0.03, abs=4e-4)
     assert fit.y0 == pytest.approx(-0.05, abs=4e-4)
     assert fit.bend == pytest.approx(bend, abs=1e-4)

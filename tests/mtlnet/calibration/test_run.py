@@ -1,4 +1,4 @@
-"""`mtlnet calibrate` and the cameras that `mtlnet predict` finds by itself."""
+"""`mtlnet calibrate`, and the cameras that `mtlnet predict` estimates itself."""
 
 import json
 import re
@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mtlnet.calibration.run import CalibrateConfig, calibrate
+from mtlnet.calibration.config import CalibrateConfig
+from mtlnet.calibration.run import calibrate
 from mtlnet.inference.rectification import Rectification
-from mtlnet.predict.kinds import Kind
 from mtlnet.predict.lenses import DriveLens, with_lens
-from mtlnet.predict.pictures import Picture
-from mtlnet.predict.sources import Source
+from mtlnet.sources.find import Source
+from mtlnet.sources.kinds import Kind
+from mtlnet.sources.pictures import Picture
 from runtime.camera_file import read_camera
 from runtime.film import Film
 from tests.mtlnet.calibration.drawn import board_pictures, chessboard, road_picture
@@ -115,7 +116,7 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
 def test_a_film_that_breaks_off_is_told_and_used(
     film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mtlnet.predict.films.missing_end", lambda path: "no end")
+    monkeypatch.setattr("mtlnet.sources.films.missing_end", lambda path: "no end")
     out = tmp_path / "camera.yaml"
     config = CalibrateConfig([str(film)], out, fov_y_deg=60.0)
     with pytest.raises(UserError, match=r"it breaks off: no end.* was written from them: pitch"):

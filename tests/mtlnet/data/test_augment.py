@@ -234,8 +234,9 @@ def test_share_and_size_of_erased_patches() -> None:
 
 
 def test_half_of_the_images_show_what_a_narrower_camera_shows() -> None:
-    """Most of them down to 40 % of the rows and half of the columns, a quarter of them (0.15 of
-    0.575) as little as is answered: a quarter of the rows and columns, but not the sky alone."""
+    """Most borders hide at most 40 % of the rows and half of the columns. A quarter of them (0.15
+    of 0.575) hide as much as the model accepts: three quarters of the rows and columns, but never
+    the whole road."""
     border = draw_params(20_000, 210, 280, np.random.default_rng(2)).border
     top, bottom, left, right = border.T
     assert border.any(1).mean() == pytest.approx(1 - (1 - BORDER_SHARE) * 0.85, abs=0.02)

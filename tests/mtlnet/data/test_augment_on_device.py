@@ -1,4 +1,4 @@
-"""Images changed where they lie look as those changed on the CPU, with the same labels."""
+"""Images augmented on the device look like those augmented on the CPU, and have the same labels."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from datagen.recording import Dataset
+from mtlnet.architecture import GRID
 from mtlnet.data.augment.on_device import DeviceAugment
 from mtlnet.data.augment.pipeline import AugmentParams, apply_params, draw_params
 from mtlnet.data.gpu_cache import GpuDataset
 from mtlnet.data.loader import Loader
 from mtlnet.data.road_ahead import RoadAhead
-from mtlnet.model.architecture import GRID
 from trackfeatures.camera import CameraParameters
 
 CPU = torch.device("cpu")
@@ -32,7 +32,7 @@ ONE_BY_ONE: dict[str, Callable[[AugmentParams, AugmentParams], AugmentParams]] =
 
 
 def drawn(count: int) -> tuple[AugmentParams, AugmentParams]:
-    """No params, and some to every image."""
+    """Parameters that change nothing, and parameters that change every image."""
     params = draw_params(count, 210, 280, np.random.default_rng(2))
     some = replace(
         params,

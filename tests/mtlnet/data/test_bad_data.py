@@ -1,4 +1,4 @@
-"""Datasets that cannot be used: one error message that says why, and no files written."""
+"""Unusable datasets: one error message with the reason, and no files written."""
 
 import json
 import shutil
@@ -12,13 +12,15 @@ import trackfeatures as tf
 from datagen.recording import Dataset, DatasetError, UndecodableImage
 from datagen.recording.mcap.footer import read_summary
 from datagen.recording.splits import Split, split_path, write_split
-from mtlnet.data.sources import find_undecodable, recorded_training_data
-from mtlnet.evaluation.ablation import AblationConfig, ablation_rows
-from mtlnet.evaluation.ablation_run import ablate
+from mtlnet.ablation.config import AblationConfig
+from mtlnet.ablation.plan import ablation_rows
+from mtlnet.ablation.run import ablate
+from mtlnet.data.rounds import find_undecodable
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
+from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.run import train
+from mtlnet.training.sources import recorded_training_data
 from tests.datagen.chunk_crcs import with_right_crcs
 from tests.mtlnet.conftest import FRAMES, TRAIN, write_round
 from tests.typed import typed
@@ -56,7 +58,7 @@ def config(data: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 def ablation(data: Path, out: Path, **changes: Any) -> None:
-    given = AblationConfig(data, out, iterations=1, seeds=(1,), batch=2, **changes)
+    given = AblationConfig(out, data=data, iterations=1, seeds=(1,), batch=2, **changes)
     ablate(given, ablation_rows())
 
 

@@ -1,4 +1,4 @@
-"""The memory of a batch is reused when nothing refers to it any more, and not before."""
+"""The memory of a batch is reused only when nothing refers to it any more."""
 
 import gc
 

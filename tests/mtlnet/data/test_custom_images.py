@@ -65,7 +65,7 @@ def test_label_limits_are_those_of_the_coding() -> None:
     [
         ("b.png,1.5,2.5,,,,0,straight", r"line 3: ml is 1.5 m; it must be from -5.5 to -0.5"),
         ("b.png,-1.5,,,,,0,straight", "line 3: ml and mr are the two sides"),
-        ("b.png,,,-3,,,0,straight", "line 3: l and r stand beside m"),
+        ("b.png,,,-3,,,0,straight", "line 3: l and r are the markings next to m"),
         ("b.png,-1,nan,,,,0,straight", "line 3: mr is nan m"),
         ("b.png,-1,x,,,,0,straight", "line 3: mr is 'x', not a number"),
         ("b.png,-1,1,,,,2.5,straight", r"line 3: angle is 2.5; it must be within 0.5 rad"),
@@ -79,8 +79,8 @@ def test_label_limits_are_those_of_the_coding() -> None:
         ("b.png,-1,?,,,,0,left", r"line 3: mr is `\?`, which only"),
         ("b.png,-1,1,,,,?,left", r"line 3: angle is `\?`, which only"),
         ("?,-1,1,,,,0,left", r"line 3: file is `\?`, which only"),
-        ("b.png,-1,1,,?,,0,left", r"line 3: l and r stand beside m: where m is `\?`"),
-        ("b.png,-1,1,?,,,0,left", "line 3: l and r stand beside m: without m"),
+        ("b.png,-1,1,,?,,0,left", r"line 3: l and r are the markings next to m: where m is `\?`"),
+        ("b.png,-1,1,?,,,0,left", "line 3: l and r are the markings next to m: without m"),
     ],
 )
 def test_a_faulty_row_is_refused_with_its_line_number(tmp_path: Path, row: str, seen: str) -> None:
@@ -117,7 +117,7 @@ def test_images_of_any_size_with_the_cameras_aspect_ratio(tmp_path: Path) -> Non
 
 
 def test_a_table_of_a_windows_program_and_names_that_are_not_utf8_are_read(tmp_path: Path) -> None:
-    """A byte order mark, CRLF, quotes; and a name in the bytes of the file system."""
+    """A byte order mark, CRLF, quotes, and a name in the bytes of the file system."""
     picture(tmp_path / "a.png", 280, 210)
     (tmp_path / "a.png").rename(tmp_path / os.fsdecode(b"caf\xe9, 1.png"))
     row = GOOD.encode().replace(b"a.png", b'"caf\xe9, 1.png"')
@@ -200,7 +200,7 @@ def test_cells_of_a_lane_follow_the_definitions() -> None:
 
 
 def test_pictures_of_their_own_cameras(tmp_path: Path) -> None:
-    """A camera of a row goes before the folder's; pitch_deg changes either."""
+    """A camera in a row has precedence over the folder's; pitch_deg changes either."""
     for name in "abc":
         picture(tmp_path / f"{name}.png", 640, 360)
     (tmp_path / "camera.yaml").write_text("{width: 640, height: 360, x: 0.0, z: 0.95}\n")
@@ -222,7 +222,7 @@ def test_pictures_of_their_own_cameras(tmp_path: Path) -> None:
     beside = (np.array([-3, 5]) - 0.5 * np.sin(0.1)) / 2 + ahead
     np.testing.assert_allclose(trained[1, :2], beside, rtol=1e-5)
     assert np.isinf(trained[1, 2:]).all()
-    # What the network answers for them is turned back into the labels.
+    # The network's answers for them are converted back to the labels.
     outputs = np.concatenate(
         [np.nan_to_num(tf.encode(trained, found.labels.angle)), np.zeros((3, 3))], axis=1
     ).astype(np.float32)
@@ -264,7 +264,8 @@ def test_refused_pictures_are_listed_where_they_are_counted(tmp_path: Path) -> N
 
 
 def test_copies_show_what_their_labels_say(tmp_path: Path) -> None:
-    """A painted point of the road lies in each copy where its camera and label say."""
+    """A painted point of the road lies in each copy at the place that the copy's camera and label
+    give."""
     camera = CameraParameters(width=641, height=361, fov_y_deg=40, x=0.5, y=0.2, z=1.0, pitch_deg=2)
     write(tmp_path, GOOD)
     _, labels = read_labels(tmp_path / "labels.csv")
@@ -285,7 +286,7 @@ def test_copies_show_what_their_labels_say(tmp_path: Path) -> None:
 def _marking_pixel(
     camera: CameraParameters, distance: float, angle: float, along: float
 ) -> NDArray[np.float64]:
-    """Where a straight marking `distance` m to the right lies `along` m ahead of the camera."""
+    """Place of a straight marking `distance` m to the right at `along` m ahead of the camera."""
     along += camera.x * np.cos(angle) - camera.y * np.sin(angle)
     ahead = along * np.cos(angle) + distance * np.sin(angle)
     left = along * np.sin(angle) - distance * np.cos(angle)
@@ -295,7 +296,7 @@ def _marking_pixel(
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_labelled_images_are_turned_upright(rectified: bool, tmp_path: Path) -> None:
-    """A PNG that is stored upside down, and a lossless WebP stored on its side."""
+    """A PNG stored upside down, and a lossless WebP stored on its side."""
     image = np.arange(280 * 210 * 3, dtype=np.uint32).reshape(210, 280, 3).astype(np.uint8)
     stored = {3: (".png", image[::-1, ::-1]), 6: (".webp", np.rot90(image))}
     for orientation, (suffix, pixels) in stored.items():

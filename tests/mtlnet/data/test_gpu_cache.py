@@ -13,7 +13,7 @@ from datagen.recording import Dataset
 from mtlnet.data.gpu_cache import MEMORY_SHARE, DeviceBatch, GpuDataset, cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.training.cuda_graph import WARM_UP, CudaGraphStep
-from mtlnet.training.loss import Losses
+from mtlnet.training.losses.multi_task import Losses
 from mtlnet.training.recipes import RECIPES
 from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
@@ -52,7 +52,7 @@ def test_only_data_that_fits_is_cached(dataset: Path) -> None:
 
 
 class FakeRecorder:
-    """In place of a CUDA graph: replaying runs the recorded function again."""
+    """Replaces a CUDA graph: replaying runs the recorded function again."""
 
     def __init__(self) -> None:
         self.ran = self.recorded = self.replayed = 0

@@ -1,4 +1,4 @@
-"""What a network learns from a round whose camera is higher or lower than the model's."""
+"""Targets of a network for a round whose camera is higher or lower than the model's."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ def dataset(folder: Path, **changes: Any) -> Frames:
 
 @pytest.fixture
 def high(tmp_path: Path) -> Frames:
-    """Rounds of lanes of 4.0 m, from a camera 1.8 m above the road: it looks two thirds as wide."""
+    """Rounds with lanes of 4.0 m and a camera 1.8 m above the road, for which a lane looks two
+    thirds as wide."""
     return dataset(tmp_path / "high", **HIGH_ROUNDS)
 
 
@@ -48,7 +49,7 @@ def test_labels_are_those_of_a_road_two_thirds_as_wide(high: Frames) -> None:
 
 
 def test_training_and_answering_are_inverse(high: Frames) -> None:
-    """A network that answers what it was trained on is right in metres of the car."""
+    """A network that answers exactly its training targets is right in metres of the car."""
     loader = Loader(high, MODEL, 4, 0, augment=False)
     classes = np.eye(3, dtype=np.float32)[high.labels.heading]
     outputs = car_outputs(np.concatenate([loader.coded, classes], 1), high)
@@ -62,7 +63,7 @@ def test_training_and_answering_are_inverse(high: Frames) -> None:
 
 
 def test_a_recorded_rounds_height_is_no_reason_for_doubt(high: Frames) -> None:
-    """A camera file of this height, 1.8 m, would be: a lane of 3.6 m looks 2.4 m wide."""
+    """A camera file with this height, 1.8 m, would make a lane of 3.6 m look 2.4 m wide."""
     outputs = np.full((len(high), 9 + COLUMNS), 0.5, np.float32)
     score = split_outputs(car_outputs(outputs, high)).ood_score
     assert score is not None

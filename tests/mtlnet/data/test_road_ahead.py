@@ -1,4 +1,4 @@
-"""What of the road ahead is learned beside the answers, and how it params with the image."""
+"""Labels of the road ahead, and how augmentation changes them."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from mtlnet.architecture import GRID
 from mtlnet.data.augment.geometric import rotate, rotations, shift_lateral
 from mtlnet.data.augment.pipeline import AugmentParams, draw_params
 from mtlnet.data.road_ahead import (
@@ -17,7 +18,6 @@ from mtlnet.data.road_ahead import (
     hard_frames,
     own_markings,
 )
-from mtlnet.model.architecture import GRID
 from mtlnet.model.auxiliary import AHEAD_M, CURVATURES, LABELS, ROWS, auxiliary_loss, split_columns
 from mtlnet.model.network import Network, initialise
 from trackfeatures.camera import CameraParameters
@@ -28,8 +28,8 @@ FOCAL = 105 / np.tan(np.radians(67.5 / 2))
 
 
 def line(aside: float, angle: float = 0.0) -> NDArray[np.float64]:
-    """A straight marking `aside` m to the right, as a car that points `angle` rad to the right of
-    the road sees it from 1.2 m: pixels (n, 2), from near to far."""
+    """A straight marking `aside` m to the right, seen from 1.2 m by a car that points `angle` rad
+    to the right of the road: pixels (n, 2), near to far."""
     ahead = np.arange(1.0, 60.0)
     right = (aside - ahead * np.sin(angle)) / np.cos(angle)
     return np.column_stack([139.5 + FOCAL * right / ahead, 104.5 + FOCAL * 1.2 / ahead])
@@ -46,13 +46,13 @@ def marked(aside: float, angle: float) -> NDArray[np.uint8]:
 
 
 def seen_columns(image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """The middle of what is white in each of `ROWS`, px."""
+    """Middle of the white pixels in each of `ROWS`, px."""
     found = []
     for row in ROWS:
         at = row - 0.5  # rows count from the upper border, pixels from their centres
         low = int(at)
         grey = image[low, :, 0] * (1 - at + low) + image[low + 1, :, 0] * (at - low)
-        grey = np.where(grey > 100, grey, 0)  # what comes into view is filled with dark road
+        grey = np.where(grey > 100, grey, 0)  # areas that come into view are filled with dark road
         found.append((grey * (np.arange(280) + 0.5)).sum() / max(grey.sum(), 1e-9))
     return np.array(found)
 
@@ -158,7 +158,7 @@ def test_hard_frames_lie_in_sharp_bends_and_near_a_change_of_class() -> None:
     mixed = np.random.default_rng(0).permutation(len(s))
     found = hard_frames(s[mixed], curvature[mixed], heading[mixed], tracks)
     assert sorted(s[mixed][found]) == [95, 100, 105, 110, 180, 185, 190, 195]
-    # Of another track, where nothing changes, none is hard.
+    # No frame of another track, where nothing changes, is hard.
     assert not hard_frames(s, np.zeros_like(s), np.ones_like(heading), tracks).any()
     both = np.array(["a", "b"] * (len(s) // 2))
     alternating = np.where(both == "a", 0, 2)

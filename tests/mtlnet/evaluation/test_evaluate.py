@@ -1,4 +1,4 @@
-"""Evaluation of a model on a dataset: what is checked before the first frame."""
+"""Evaluation of a model on a dataset: checks before the first frame."""
 
 from pathlib import Path
 

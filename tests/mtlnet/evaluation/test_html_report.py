@@ -1,4 +1,4 @@
-"""The evaluation's page: its figures are the report's, and its worst frames are the worst."""
+"""The page of an evaluation has the figures of the report, and shows the worst frames."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
+from mtlnet.data.description import mean_labels
 from mtlnet.evaluation.html_report import (
     CAPTION_PX,
     MAX_ROUNDS,
@@ -23,7 +24,7 @@ from mtlnet.evaluation.html_report import (
     worst_frames,
     write_worst_sheet,
 )
-from mtlnet.evaluation.metrics import evaluate_by_groups, mean_labels, signed_errors
+from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.inference.uncertainty import FEATURES
 from tests.mtlnet.conftest import HIGH_CAMERA, HIGH_ROUNDS, write_dataset
@@ -32,7 +33,7 @@ from trackfeatures.camera import CameraParameters
 
 ORDER = ("to_lane_centre", "angle", "ml", "mr", "m", "l", "r")
 ERRORS_M = {9: 1.0, 30: -0.8, 60: 0.3}
-"""Frames on which the predicted `ml` has this error in m."""
+"""Frames with this error of the predicted `ml`, m."""
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,7 @@ def test_the_worst_frames_are_the_worst() -> None:
     for one in chosen:
         column = FEATURES.index(one.feature)
         assert one.error == errors[one.row, column]
-        # Every worse frame is too near to one that is shown already.
+        # Every worse frame is too near to a frame that is shown already.
         for row in np.flatnonzero(np.abs(errors[:, column]) > abs(one.error)).tolist():
             assert any(
                 abs(row - w.row) < MIN_FRAMES_APART and rounds[row] == rounds[w.row] for w in taken

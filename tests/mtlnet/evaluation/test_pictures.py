@@ -1,4 +1,4 @@
-"""Judging labelled pictures: figures worked out by hand, and the page with the failures first."""
+"""Evaluation on labelled pictures: figures worked out by hand, and the page with failures first."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +43,7 @@ def images(tmp_path: Path) -> CustomImages:
 
 
 def outputs() -> NDArray[np.float32]:
-    """(3, 17): the answers above, straight ahead; the second is out of distribution."""
+    """Outputs (3, 17): the answers above, straight ahead; the second is out of distribution."""
     distances = np.full((3, 5), np.nan)
     distances[:, :2] = ANSWERED
     coded = tf.encode(distances, ANGLES)

@@ -40,7 +40,7 @@ FOUR = "g-track-3, heavy shadow: four darkest intervals"
 
 
 class PaintedEngine:
-    """Answers the truth plus so many mm and 0.1 mrad as the red of the image, and the class of its
+    """Answers the truth plus as many mm and 0.1 mrad as the red of the image, and the class in its
     green."""
 
     kind, precision = "painted", "f32"
@@ -88,8 +88,8 @@ def record(
 
 @pytest.fixture
 def rounds(tmp_path: Path) -> Path:
-    """Drives: errors of 10 mm, in the shade of g-track-3 of 70 mm, on dirt-3 of 40 mm; all classes
-    are right. The other round: errors of 5 mm, seven of ten classes are right."""
+    """Drives with errors of 10 mm, 70 mm in the shade of g-track-3, 40 mm on dirt-3, and correct
+    classes; another round with errors of 5 mm and seven of ten classes correct."""
     (tmp_path / "rounds").mkdir()
     (tmp_path / "splits").mkdir()
     straight = np.full(FRAMES, 1)

@@ -1,7 +1,6 @@
-"""`mtlnet evaluate` on the imported real roads gives the figures of their own judge.
-
-Skipped where the pictures are not: in $DRIVERVIEW_REAL_ROADS, or beside $TORCS_TRACKS.
-"""
+"""`mtlnet evaluate` on the imported real roads gives the figures of the pictures' own evaluation
+program. Skipped without the pictures, which are in $DRIVERVIEW_REAL_ROADS or next to
+$TORCS_TRACKS."""
 
 import contextlib
 import csv
@@ -42,7 +41,7 @@ pytestmark = pytest.mark.skipif(FOLDER is None, reason="no real roads: set DRIVE
 
 
 def compare(folder: Path, tmp_path: Path, *options: str) -> None:
-    """Judge the pictures of a table by its own program and by ours, with all copies."""
+    """Evaluate the pictures of a table with its own program and with ours, with all copies."""
     assert FOLDER is not None
     cases, printed = tmp_path / "cases.json", io.StringIO()
     arguments = ["judge.py", str(folder), "default", "--json", str(cases), *options]

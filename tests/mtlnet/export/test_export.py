@@ -24,7 +24,6 @@ from mtlnet.export.int8 import (
     gate,
     operation_names,
 )
-from mtlnet.export.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
 from mtlnet.inference.engine import (
     EXPORT_FILE,
     INT8,
@@ -44,8 +43,9 @@ from mtlnet.inference.model_card import (
 )
 from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.network import Network, fold, load_network
+from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
+from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.run import train
 from tests.mtlnet.conftest import require_close
 from trackfeatures.errors import UserError
 
@@ -132,7 +132,7 @@ def test_an_openvino_model_answers_any_number_of_images_each_as_alone(
 
 
 def test_the_served_graph_is_one_of_one_image() -> None:
-    """A graph for any number of images takes longer for one."""
+    """A graph for any number of images is slower for one."""
     run = resolve_run("default")
     assert list(read_graph(run, read_card(run)).input(0).shape) == [1, 210, 280, 3]
 
@@ -188,7 +188,7 @@ def test_int8_is_the_default_once_it_passed_its_gate(
     rounding = [op for op in rounded_to if op.get_type_name() == "FakeQuantize"]
     readers = {i.get_node().get_type_name() for op in rounding for i in consumers(op)}
     assert len(rounding) == 3
-    assert readers <= {"Convolution", "MaxPool"}  # nothing of the heads
+    assert readers <= {"Convolution", "MaxPool"}  # nothing from the heads
     reference = load_engine(run, precision="f32")(frame)
     quantised = load_engine(run, precision="int8")(frame)
     assert (quantised != reference).any()
@@ -313,7 +313,7 @@ def test_a_published_graph_is_on_the_disk_before_it_has_its_name(
     def record(path: Path) -> None:
         synced.append((path.name, sorted(found.name for found in tmp_path.iterdir())))
 
-    monkeypatch.setattr("mtlnet.export.openvino_graph.fsync_path", record)
+    monkeypatch.setattr("mtlnet.openvino_graph.fsync_path", record)
     write_graph(fold(Network()), tmp_path / "model.xml", tmp_path / "model.bin")
     staged, named = ["staged.bin", "staged.xml"], ["model.bin", "model.xml"]
     assert sorted(synced[:2]) == [("staged.bin", staged), ("staged.xml", staged)]

@@ -1,4 +1,4 @@
-"""A model as weights alone answers as the run it was made of, and is refused when damaged."""
+"""A model as weights alone gives the answers of its run, and is refused when damaged."""
 
 import json
 import shutil
@@ -13,19 +13,14 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from datagen.recording import Dataset
+from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.evaluation.evaluate import evaluate
-from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.export.ship import half, ship_model, write_page
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import (
-    UNCERTAINTY_WEIGHTS,
-    WEIGHTS,
-    ModelError,
-    golden_image,
-    read_card,
-)
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.inference.weights_file import read_weights
-from mtlnet.model.architecture import HEIGHT, WIDTH
+from mtlnet.openvino_graph import TOLERANCE
 from serve.scheduling.warmup import warm_up
 from tests.mtlnet.conftest import write_dataset
 from trackfeatures.camera import CameraParameters
@@ -182,7 +177,7 @@ def test_weights_are_read_as_the_formats_own_package_reads_them(tmp_path: Path) 
 def test_no_whole_file_of_weights(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "broken.safetensors"
     path.write_bytes(content)
-    with pytest.raises(ModelError, match="no whole file of weights"):
+    with pytest.raises(ModelError, match="not a complete weights file"):
         read_weights(path)
 
 

@@ -1,4 +1,5 @@
-"""A machine without OpenVINO trains, ships and evaluates by torch; another serves the result."""
+"""Without OpenVINO a machine trains, ships and evaluates by torch; another machine serves the
+result."""
 
 import sys
 from pathlib import Path
@@ -9,17 +10,18 @@ import torch
 
 from benchmarks.gpu.publish_checkpoint import publish_checkpoint
 from datagen.recording import Dataset
+from mtlnet.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.data.description import describe_data
 from mtlnet.evaluation.evaluate import evaluate
-from mtlnet.evaluation.metrics import describe_data
-from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.export.publish import Provenance, export_text, publish
 from mtlnet.export.ship import ship_model
 from mtlnet.inference.engine import has_openvino, load_engine
-from mtlnet.inference.model_card import CARD, UNCERTAINTY_WEIGHTS, WEIGHTS, golden_image, read_card
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import CARD, UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
 from mtlnet.inference.torch_engine import TorchEngine
 from mtlnet.inference.uncertainty import FittedUncertainty, read_uncertainty_head
-from mtlnet.model.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.model.network import fold, load_network, predict_images
+from mtlnet.openvino_graph import TOLERANCE
 from mtlnet.training.checkpoint import save_checkpoint
 from mtlnet.training.recipes import find_recipe
 from mtlnet.training.run import create_run
@@ -63,7 +65,7 @@ def test_what_torch_alone_publishes_and_ships_is_served(
 def test_a_training_that_was_stopped_is_published_from_its_checkpoint(
     dataset: Path, tmp_path: Path
 ) -> None:
-    """What `benchmarks/gpu_run.py` does where the minutes ended before the training did."""
+    """Publishing by `benchmarks/gpu_run.py` when the minutes end before the training does."""
     config = training_config(dataset, tmp_path / "run")
     recipe, data = find_recipe("fast"), Dataset.open(dataset)
     about = describe_data(data, data.select("train"))

@@ -180,8 +180,8 @@ def test_names_in_a_card_lead_out_of_no_folder(copy: Path, key: str) -> None:
 
 
 def test_a_signal_after_an_engine_was_dropped_in_another_thread(published: Path) -> None:
-    """OpenVINO gives the thread that loads its CPU plugin a signal stack and takes its memory back
-    with the last reference: a signal then ended the process with SIGSEGV."""
+    """OpenVINO gives the thread that loads its CPU plugin a signal stack, and unmaps it with the
+    last reference; a later signal ended the process with SIGSEGV."""
     program = (
         "import signal, sys, threading\n"
         "from pathlib import Path\n"

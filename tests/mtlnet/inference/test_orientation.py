@@ -1,7 +1,5 @@
-"""Orientation: every path gives the pixels of the same picture stored upright.
-
-The eight turns are numpy's, after the table of TIFF 6.0; ours are OpenCV's.
-"""
+"""Orientation: all paths give the pixels of the same picture stored upright. The expected rotations
+are numpy's, after the table of TIFF 6.0; ours are OpenCV's."""
 
 import struct
 import zlib
@@ -39,14 +37,14 @@ TURNS: dict[int, Callable[[Pixels], Pixels]] = {
     7: lambda image: image[::-1, ::-1].transpose(1, 0, 2),
     8: lambda image: np.rot90(image),
 }
-"""The stored image made upright, by orientation."""
+"""Correction of the stored image, by orientation."""
 BACK = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 ALL = range(1, 9)
 
 
 def exif(orientation: int, order: str = ">", kind: int = 3, count: int = 1) -> bytes:
-    """An Exif block with a maker before the orientation, and another orientation in its thumbnail's
-    directory."""
+    """An Exif block with a maker tag before the orientation, and another orientation in the
+    thumbnail's directory."""
     mark = b"MM" if order == ">" else b"II"
     value = struct.pack(order + ("I" if kind == 4 else "HH"), *([orientation] + [0] * (kind != 4)))
     maker = struct.pack(order + "HHI4s", 0x010F, 2, 4, b"Cam\0")
@@ -76,7 +74,8 @@ def in_png(image: Pixels, block: bytes, *, at_end: bool = False) -> bytes:
 
 
 def by_opencv(suffix: str, image: Pixels, block: bytes) -> bytes:
-    """Written with this Exif block; libavif makes `irot` and `imir` of its orientation."""
+    """An AVIF written with this Exif block; libavif converts its orientation to `irot` and
+    `imir`."""
     done, body = cv2.imencodeWithMetadata(
         suffix,
         np.ascontiguousarray(image[:, :, ::-1]),
@@ -101,14 +100,14 @@ def in_tiff(image: Pixels, orientation: int) -> bytes:
 
 
 def picture(width: int = 300, height: int = 210) -> Pixels:
-    """Smooth, and unlike any turn of itself."""
+    """A smooth image that differs from all its rotations and mirror images."""
     x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
     planes = [255 * x, 255 * y * y, 180 * x * (1 - y)]
     return np.stack(planes, axis=2).astype(np.uint8)
 
 
 def stored(orientation: int, image: Pixels | None = None) -> Pixels:
-    """What a camera stores that gives `image` upright."""
+    """The stored image that is `image` when upright."""
     upright = picture() if image is None else image
     return np.ascontiguousarray(TURNS[BACK[orientation]](upright))
 
@@ -121,7 +120,8 @@ def by_service(body: bytes) -> Pixels:
 def test_a_turned_jpeg_and_png_give_the_pixels_of_the_upright_one(
     orientation: int, tmp_path: Path
 ) -> None:
-    """In the service and locally, wider than the view and so cropped, in both byte orders."""
+    """In the service and locally, for an image that is wider than the view and so cropped, in both
+    byte orders."""
     expected = crop_and_resize(picture(), VIEW)
     image, path = stored(orientation), tmp_path / "a"
     for order in "<>":
@@ -164,7 +164,7 @@ def test_sizes_and_crops_are_those_of_the_upright_image(orientation: int) -> Non
 
 
 def test_a_large_jpeg_is_turned_too() -> None:
-    """Over this size its structure is read twice, by other code."""
+    """Above this size the structure is read again, by other code."""
     noise = np.random.default_rng(1).integers(0, 256, (600, 800, 3), np.uint8)
     body = in_jpeg(stored(6, noise), exif(6))
     assert len(body) > LATE_CHECK_BYTES
@@ -187,7 +187,7 @@ def test_exif_is_found_behind_other_segments_and_the_first_one_counts() -> None:
         assert inspect(in_jpeg(image, exif(3), *before), VIEW).orientation == 3
     twice = in_jpeg(image, exif(6), segment(b"Exif\0\0" + exif(3)))
     assert inspect(twice, VIEW).orientation == 3
-    assert inspect(in_jpeg(image, b"", xmp), VIEW).orientation == 1  # XMP is no source
+    assert inspect(in_jpeg(image, b"", xmp), VIEW).orientation == 1  # XMP is not read
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_a_broken_orientation_counts_as_none(block: bytes) -> None:
 
 
 def test_only_the_first_directory_is_read() -> None:
-    """Not the thumbnail's; and of endless entries no more than a thousand."""
+    """The orientation of the thumbnail is not used; of many entries at most a thousand are read."""
     alone = b"MM" + struct.pack(">HIHI", 42, 8, 0, 14)
     alone += struct.pack(">HHHIHHI", 1, 0x0112, 3, 1, 6, 0, 0)
     assert exif_orientation(alone) == 1

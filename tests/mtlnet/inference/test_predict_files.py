@@ -1,5 +1,4 @@
-"""Reading image files of this machine: the pixels of the service, other kinds, no limits of a
-service."""
+"""Image files of this machine: the same pixels as in the service, more kinds, fewer limits."""
 
 import os
 import struct
@@ -54,7 +53,7 @@ def test_a_huge_image_is_refused_by_its_header(tmp_path: Path) -> None:
 
 
 def test_a_file_gives_the_same_pixels_as_in_the_service(tmp_path: Path) -> None:
-    """Also a smaller one, which is scaled, and one whose name is not UTF-8."""
+    """Also a smaller image, which is scaled, and one whose name is not UTF-8."""
     small = simplejpeg.encode_jpeg(np.ascontiguousarray(NOISE[:105, :140]), 90)
     for body in (JPEG, PNG, small):
         path = tmp_path / os.fsdecode(b"caf\xe9.jpg")
@@ -123,7 +122,7 @@ def test_what_opencv_reads_is_read_whatever_its_name(
 
 
 def test_a_cmyk_jpeg_and_a_jpeg_without_huffman_tables_are_read(tmp_path: Path) -> None:
-    """The latter are single frames of Motion JPEG."""
+    """The last ones are single frames of Motion JPEG."""
     path, rgb = tmp_path / "a.jpg", SMOOTH[:, :, ::-1]
     ink = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])  # as Adobe stores it: inverted
     path.write_bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(ink), 95, "CMYK", "444"))
@@ -137,7 +136,8 @@ def test_a_cmyk_jpeg_and_a_jpeg_without_huffman_tables_are_read(tmp_path: Path) 
 
 @pytest.mark.parametrize("behind", [bytes(100_000), b"\0\0\0\x18ftypmp42" + bytes(5000), JPEG])
 def test_bytes_behind_an_image_do_not_matter_locally(behind: bytes, tmp_path: Path) -> None:
-    """Padding, the film of a Motion Photo, the second picture of a stereo pair (MPO)."""
+    """Bytes after the image: padding, the film of a Motion Photo, the second picture of a stereo
+    pair (MPO)."""
     path = tmp_path / "a"
     for body in (JPEG, PNG):
         path.write_bytes(body + behind)
@@ -149,7 +149,7 @@ def test_bytes_behind_an_image_do_not_matter_locally(behind: bytes, tmp_path: Pa
 
 
 def test_a_photo_larger_than_the_service_takes_is_scaled(tmp_path: Path) -> None:
-    """12 million pixels, also as ten scans, and a PNG of many small chunks."""
+    """Images of 12 million pixels, also with ten scans, and a PNG of many small chunks."""
     large = cv2.resize(SMOOTH, (4000, 3000), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
     options: list[list[int]] = [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]]
     bodies = [encoded(".jpg", large, *each) for each in options]

@@ -21,7 +21,7 @@ OTHER = CameraParameters(width=640, height=360, fov_y_deg=40.0, x=1.2, z=1.25, p
 def pixel(
     camera: CameraParameters, ahead: float, left: float, size: tuple[int, int]
 ) -> list[float]:
-    """Where a point of a flat road, m from the camera, is in its image of that size: (u, v)."""
+    """Pixel (u, v) of a point of a flat road, m from the camera, in its image of this size."""
     focal, down = camera.focal_px * size[1] / camera.height, np.radians(camera.pitch_deg)
     depth = ahead * np.cos(down) + camera.height_above_road_m * np.sin(down)
     below = camera.height_above_road_m * np.cos(down) - ahead * np.sin(down)

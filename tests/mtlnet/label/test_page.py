@@ -1,4 +1,4 @@
-"""The label page in a browser: handles dragged by the mouse, keys, and what is saved meanwhile."""
+"""The label page in a browser: handles dragged with the mouse, keys, and what is saved."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ VIEW = CameraParameters(width=640, height=360, fov_y_deg=40, x=0.0, z=0.97)
 
 
 def drag_onto_markings(browser: Browser) -> None:
-    """All four round handles onto the drawn markings."""
+    """Drag all four round handles onto the drawn markings."""
     targets = dict(zip(("left", "right"), marking_pixels(VIEW, TRUE, [6.0, 25.0]), strict=True))
     for side, which, target in (
         ("left", 0, 0),
@@ -52,7 +52,7 @@ def test_pictures_are_labelled_by_mouse_and_keys(
         drag_onto_markings(browser)
         browser.press("Enter")
         browser.wait("document.body.dataset.ready === '1'")
-        # The page takes a handle where the mouse takes it: to a pixel of the screen.
+        # A handle moves with the mouse, in whole pixels of the screen.
         [picture], labels = read_labels(table)
         assert picture.file == "1.png"
         tolerance = 0.02 if width > 600 else 0.05
@@ -65,7 +65,7 @@ def test_pictures_are_labelled_by_mouse_and_keys(
         browser.wait("document.body.dataset.ready === '2'")
         _, labels = read_labels(table)
         assert labels.heading.tolist() == [1, 2]
-        # Undo takes the last label back, then the one before.
+        # Undo removes the last label, then the one before.
         browser.press("u")
         browser.wait("document.body.dataset.ready === '1'")
         assert [p.file for p in read_labels(table)[0]] == ["1.png"]

@@ -1,4 +1,4 @@
-"""The label page's interface: drag, save, undo; and what a request may not do."""
+"""The label page's interface: drag, save, undo, and refused requests."""
 
 from pathlib import Path
 
@@ -143,7 +143,7 @@ def test_links_out_of_the_folder_are_left_out(pictures: Path) -> None:
 
 def test_a_folder_without_a_camera_is_refused(pictures: Path) -> None:
     (pictures / "camera.yaml").rename(pictures.parent / "dashcam.yaml")
-    with pytest.raises(UserError, match=r"has no camera\.yaml, without which no metres follow"):
+    with pytest.raises(UserError, match=r"has no camera\.yaml, which is needed to compute metres"):
         LabelFolder(pictures, None, CameraParameters())
     folder = LabelFolder(pictures, pictures.parent / "dashcam.yaml", CameraParameters())
     assert folder.camera(0, 1280, 720).height_above_road_m == pytest.approx(1.22)

@@ -1,4 +1,4 @@
-"""Answers as distributions over bins: targets, what is read from scores, and what is learned."""
+"""Answers as distributions over bins: targets, answers from scores, learning."""
 
 from pathlib import Path
 
@@ -7,11 +7,10 @@ import pytest
 import torch
 
 import trackfeatures as tf
+from mtlnet.architecture import ABSENT_ABOVE, ANGLE_BINS, DISTANCE_BINS, GRID, grid_size
 from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
-from mtlnet.export.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
 from mtlnet.inference.engine import openvino_core
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
-from mtlnet.model.architecture import ABSENT_ABOVE, ANGLES, GRID, PLACES, grid_size
 from mtlnet.model.bins import (
     Scores,
     absent_in,
@@ -22,8 +21,10 @@ from mtlnet.model.bins import (
     read_scores,
 )
 from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
-from mtlnet.training.bins_loss import bins_loss
-from mtlnet.training.loss import Losses
+from mtlnet.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
+from mtlnet.training.losses.bins import bins_loss
+from mtlnet.training.losses.multi_task import Losses
+from mtlnet.training.losses.task_weighting import TaskWeighting
 
 NAN = float("nan")
 CASES = [
@@ -62,7 +63,7 @@ def test_labels_say_what_is_absent() -> None:
 def test_what_is_read_from_a_target_is_its_value() -> None:
     coded = coded_cases()
     distances, angles = bin_targets(coded)
-    assert (distances.shape, angles.shape) == ((4, 5, PLACES + 1), (4, ANGLES))
+    assert (distances.shape, angles.shape) == ((4, 5, DISTANCE_BINS + 1), (4, ANGLE_BINS))
     read = read_scores(distances.clamp_min(1e-9).log(), angles.clamp_min(1e-9).log())
     np.testing.assert_allclose(read.numpy(), coded.numpy(), atol=4e-4)
     found, angle = tf.decode(read.numpy())
@@ -71,33 +72,36 @@ def test_what_is_read_from_a_target_is_its_value() -> None:
 
 
 def test_of_two_peaks_the_higher_is_the_answer() -> None:
-    both = 0.6 * normal_targets(torch.tensor(-3.0), -5.0, 0.0, PLACES)
-    both += 0.4 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, PLACES)
+    both = 0.6 * normal_targets(torch.tensor(-3.0), -5.0, 0.0, DISTANCE_BINS)
+    both += 0.4 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, DISTANCE_BINS)
     share = float(expectation(both.clamp_min(1e-9).log()))
     assert -5.0 + 5.0 * share == pytest.approx(-3.0, abs=0.01)
 
 
 def test_the_spread_of_two_peaks_is_their_distance() -> None:
-    width = 5.0 / PLACES
-    one = normal_targets(torch.tensor(-3.0), -5.0, 0.0, PLACES)
-    both = 0.5 * one + 0.5 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, PLACES)
-    scores = torch.zeros(1, 5, PLACES + 1)
+    width = 5.0 / DISTANCE_BINS
+    one = normal_targets(torch.tensor(-3.0), -5.0, 0.0, DISTANCE_BINS)
+    both = 0.5 * one + 0.5 * normal_targets(torch.tensor(-1.0), -5.0, 0.0, DISTANCE_BINS)
+    scores = torch.zeros(1, 5, DISTANCE_BINS + 1)
     scores[0, 0, :-1], scores[0, 1, :-1] = one.clamp_min(1e-9).log(), both.clamp_min(1e-9).log()
-    scores[0, :, -1] = 5.0  # how likely "absent" is does not matter
-    spread = np.exp(log_spreads(scores, torch.zeros(1, ANGLES)).numpy()[0])
+    scores[0, :, -1] = 5.0  # the probability of "absent" does not matter
+    spread = np.exp(log_spreads(scores, torch.zeros(1, ANGLE_BINS)).numpy()[0])
     assert spread[0] == pytest.approx(1.0, abs=0.1)
     assert spread[1] * width == pytest.approx(1.0, abs=0.02)
-    assert spread[5] == pytest.approx(ANGLES / 12**0.5, rel=1e-3)  # a uniform distribution
+    assert spread[5] == pytest.approx(ANGLE_BINS / 12**0.5, rel=1e-3)  # a uniform distribution
 
 
 def test_both_markings_of_the_lane_are_absent_together() -> None:
-    scores = torch.zeros(2, 5, PLACES + 1)
+    scores = torch.zeros(2, 5, DISTANCE_BINS + 1)
     scores[:, 0, 45] = scores[:, 1, 20] = scores[:, 2:, 30] = 8.0
-    scores[0, 0, PLACES], scores[1, 0, PLACES] = 7.0, 12.0  # a little unsure, and quite sure
-    distances, _ = tf.decode(read_scores(scores, torch.zeros(2, ANGLES)).numpy())
+    scores[0, 0, DISTANCE_BINS], scores[1, 0, DISTANCE_BINS] = (
+        7.0,
+        12.0,
+    )  # a little unsure, and quite sure
+    distances, _ = tf.decode(read_scores(scores, torch.zeros(2, ANGLE_BINS)).numpy())
     assert np.isnan(distances[:, :2]).tolist() == [[False, False], [False, False]]
-    scores[1, 1, PLACES] = 7.99  # the mean of both probabilities is above a half
-    distances, _ = tf.decode(read_scores(scores, torch.zeros(2, ANGLES)).numpy())
+    scores[1, 1, DISTANCE_BINS] = 7.99  # the mean of both probabilities is above a half
+    distances, _ = tf.decode(read_scores(scores, torch.zeros(2, ANGLE_BINS)).numpy())
     assert np.isnan(distances[:, :2]).tolist() == [[False, False], [True, True]]
 
 
@@ -112,10 +116,10 @@ def test_both_markings_of_the_lane_are_absent_together() -> None:
 def test_the_outer_markings_are_absent_above_a_higher_probability(
     probability: float, absent: list[bool]
 ) -> None:
-    scores = torch.full((1, 5, PLACES + 1), -20.0)
+    scores = torch.full((1, 5, DISTANCE_BINS + 1), -20.0)
     scores[0, :, 35] = np.log(1 - probability)
-    scores[0, :, PLACES] = np.log(probability)
-    coded = read_scores(scores, torch.zeros(1, ANGLES))
+    scores[0, :, DISTANCE_BINS] = np.log(probability)
+    coded = read_scores(scores, torch.zeros(1, ANGLE_BINS))
     ends = np.array([tf.RANGES[name].inactive for name in tf.MARKINGS], float)
     answered = tf.decode_values(coded.numpy())[0, :5]
     assert np.isclose(answered, ends, atol=1e-4).tolist() == absent
@@ -127,7 +131,8 @@ def test_the_loss_is_least_at_the_target_and_follows_alpha() -> None:
     sure = torch.nn.functional.one_hot(heading, 3) * 20.0
 
     def loss(distance: torch.Tensor, alpha: tuple[float, float, float]) -> Losses:
-        return bins_loss(Scores(distance, exact[1], sure), coded, heading, alpha)
+        weighting = TaskWeighting("fixed", alpha, torch.device("cpu"))
+        return bins_loss(Scores(distance, exact[1], sure), coded, heading, weighting.total)
 
     best, off = (loss(d, (1.0, 0.0, 0.0)) for d in (exact[0], exact[0].roll(3, 2)))
     assert float(best.total) < float(off.total) - 1.0
@@ -138,12 +143,14 @@ def test_the_loss_is_least_at_the_target_and_follows_alpha() -> None:
 
 
 def made() -> Network:
-    """A network whose heads are as sure as trained ones."""
+    """A network whose heads have scores as large as trained ones."""
     network = Network(architecture=GRID, batch_norm=True)
     initialise(network, 1)
     network.train()
     with torch.no_grad():
-        network(torch.from_numpy(images(4)))  # moves the running statistics off their start
+        network(
+            torch.from_numpy(images(4))
+        )  # moves the running statistics from their initial values
         for name in ("distance", "angle"):
             network.get_parameter(f"heads.{name}.weight").mul_(30)
     return network.eval()
@@ -196,9 +203,9 @@ def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
 
 def test_the_graph_gives_the_probabilities_of_absence() -> None:
     network, frames = fold(made()), images(6, 7)
-    with torch.no_grad():  # scores of "absent" large enough to matter, other for each image
+    with torch.no_grad():  # large scores of "absent", different for each image
         rows = network.get_parameter("heads.distance.weight")
-        rows.view(len(tf.MARKINGS), PLACES + 1, -1)[:, -1] *= 5.0
+        rows.view(len(tf.MARKINGS), DISTANCE_BINS + 1, -1)[:, -1] *= 5.0
     answers = run_network(network, frames)
     found = run_graph(build_graph(network), "f32", frames)
     assert found.shape == (6, OUTPUTS + len(tf.MARKINGS))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtlnet.model.architecture import GRID, GRID_RESIDUAL, MTL, SHARED, Architecture, Pool
+from mtlnet.architecture import GRID, GRID_RESIDUAL, MTL, SHARED, Architecture, Pool
 from mtlnet.model.cpu_kernels.convolutions import (
     im2col_convolution,
     space_to_depth,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtlnet.model.architecture import FEATURES, GRID, SHARED, Conv, same_padding
+from mtlnet.architecture import FEATURES, GRID, SHARED, Conv, same_padding
 from mtlnet.model.network import (
     Network,
     fold,

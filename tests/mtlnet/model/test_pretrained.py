@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import nn
 
+from mtlnet.architecture import GRID, GRID_RESIDUAL, MTL, find_architecture
 from mtlnet.inference.model_card import WEIGHTS
-from mtlnet.model.architecture import GRID, GRID_RESIDUAL, MTL, find_architecture
 from mtlnet.model.network import Network, initialise, predict_images
 from mtlnet.model.pretrained import NEW_SCALE, load_pretrained, match_convolutions
 from trackfeatures.errors import UserError
@@ -41,13 +41,13 @@ def model(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def started(model: Path, name: str, *, other: str = "") -> Network:
     network = Network(architecture=find_architecture(name), batch_norm=True)
     initialise(network, 5)
-    load_pretrained(network, model, images(8, 0), other)
+    load_pretrained(network, model / WEIGHTS, images(8, 0), other)
     return network
 
 
 def loaded(model: Path) -> Network:
     network = Network(architecture=find_architecture(model.name))
-    load_pretrained(network, model)
+    load_pretrained(network, model / WEIGHTS)
     return network
 
 

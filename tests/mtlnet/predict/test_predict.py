@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.inference.model_card import ModelCard, read_card
 from mtlnet.inference.rectification import Rectification
-from mtlnet.predict.films import read_film_header
 from mtlnet.predict.run import predict_files
-from mtlnet.predict.sources import find_sources
 from mtlnet.predict.writers import TEXT_HEIGHT
+from mtlnet.sources.films import read_film_header
+from mtlnet.sources.find import find_sources
 from tests.mtlnet.conftest import HIGH_ROUNDS, write_dataset, write_round
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -61,7 +61,7 @@ def write_film(path: Path, levels: list[int]) -> Path:
 def test_images_and_films_of_another_camera(
     engine: BrightnessEngine, dataset: Path, tmp_path: Path
 ) -> None:
-    """Half of the focal length: the middle half of the image is what the model's camera sees."""
+    """With half of the focal length the model's camera sees the middle half of the image."""
     image = np.zeros((420, 560, 3), np.uint8)
     image[105:315, 140:420] = 200
     wide = replace(CameraParameters(), fov_y_deg=106.36, z=1.55)
@@ -72,7 +72,7 @@ def test_images_and_films_of_another_camera(
     rows = predict_files(engine, [name, str(film)], [tmp_path / "all.csv"], lens)
     assert [row["image"] for row in rows] == [name, f"{film}#0", f"{film}#1"]
     assert rows[0]["angle_rad"] == pytest.approx(200 / 255 - 0.5, abs=0.01)
-    # 1.8 in place of 1.2 m above the road: half as far again, but for what the camera's place adds.
+    # 1.8 instead of 1.2 m above the road: 1.5 times as far, apart from the camera's own position.
     angle = rows[0]["angle_rad"]
     seen = float(tf.decode(np.full((1, 6), 0.5))[0][0, 3]) - 0.75 * np.sin(angle)
     assert rows[0]["distances_m"]["m"] == pytest.approx(1.5 * seen + 0.75 * np.sin(angle))
@@ -207,7 +207,8 @@ def test_a_damaged_image_does_not_stop_the_others(engine: BrightnessEngine, tmp_
 def test_one_input_that_cannot_be_read_costs_no_other(
     engine: BrightnessEngine, dataset: Path, tmp_path: Path
 ) -> None:
-    """A damaged, a cut, a foreign and another camera's round, a missing file, a wrong pattern."""
+    """A damaged, a truncated, a foreign and another camera's round, a missing file, a wrong
+    pattern."""
     source = sorted((dataset / "rounds").glob("*.mcap"))[0]
     (tmp_path / "cut.mcap").write_bytes(source.read_bytes()[:5000])
     (tmp_path / "none.mcap").write_bytes(b"no round")
@@ -307,7 +308,7 @@ def test_a_full_disk_keeps_what_is_done_and_is_told(
 
 
 def test_nothing_is_written_after_an_error(engine: BrightnessEngine, tmp_path: Path) -> None:
-    """Answers are written on a thread of their own, while the next ones are made."""
+    """Answers are written on another thread while the next ones are computed."""
     film = write_film(tmp_path / "in.mp4", [30] * 60)
     with (
         mock.patch("mtlnet.predict.writers.draw_prediction", side_effect=OSError("no more")),
@@ -334,7 +335,7 @@ def test_a_wider_lens_is_cropped_to_the_models_view(
     engine: BrightnessEngine, tmp_path: Path
 ) -> None:
     image = np.zeros((420, 560, 3), np.uint8)
-    image[105:315, 140:420] = 255  # what half the tangent of the field of view shows
+    image[105:315, 140:420] = 255  # shown by half the tangent of the field of view
     path = tmp_path / "wide.png"
     cv2.imwrite(str(path), image)
     camera: CameraParameters = engine.card.camera

@@ -1,8 +1,9 @@
-"""A CUDA graph's rules on a CPU: a step is recorded once, operation by operation, and replayed.
+"""The rules of a CUDA graph on a CPU: a step is recorded once, operation by operation, and
+replayed.
 
 As in a recording on a GPU, Python runs only once: a number or a branch of Python is then a constant
 of the tape, and a tensor is read from the memory that the recording used. Operations for which a
-GPU would have to wait, or copy from the host's memory, are refused.
+GPU would have to wait or to copy from the host's memory are refused.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from mtlnet.training.loss import Losses
+from mtlnet.training.losses.multi_task import Losses
 
 REFUSED = (
     "_local_scalar_dense",  # Tensor.item(), float(tensor), if tensor
@@ -25,7 +26,8 @@ REFUSED = (
 
 
 class Tape(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch's
-    """Within its context, operations run and are kept; `replay` runs them on the same memory."""
+    """Within the context, operations run and are recorded; `replay` runs them on the same
+    memory."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]  # torch's
@@ -43,7 +45,7 @@ class Tape(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch's
 
     @torch.no_grad()
     def replay(self) -> None:
-        """Run the operations again; each result lands in the memory of the recorded one."""
+        """Run the operations again; each result is written to the memory of the recorded one."""
         for func, args, kwargs, result in self.operations:
             again = func(*args, **kwargs)
             for new, old in zip(tree_leaves(again), tree_leaves(result), strict=True):
@@ -56,7 +58,7 @@ def _by_mask(indices: Any) -> bool:
 
 
 class TapeRecorder:
-    """In place of `mtlnet.training.cuda_graph.CudaRecorder`."""
+    """Replaces `mtlnet.training.cuda_graph.CudaRecorder`."""
 
     def __init__(self) -> None:
         self.ran = self.recorded = self.replayed = 0
@@ -66,7 +68,8 @@ class TapeRecorder:
         return work()
 
     def record(self, work: Callable[[], Losses]) -> Callable[[], Losses]:
-        """Unlike a GPU, a tape takes the step while it records: that is the first replay."""
+        """Unlike a GPU, a tape takes the step while it records, so the recording is the first
+        replay."""
         self.recorded += 1
         tape = Tape()
         with tape:

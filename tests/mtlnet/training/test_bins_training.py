@@ -1,4 +1,4 @@
-"""A network that answers in bins learns, is published, and is run like any other."""
+"""A network with heads over bins learns, is published, and runs like any other."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from datagen.recording import Dataset
+from mtlnet.architecture import GRID
 from mtlnet.data.loader import Loader
 from mtlnet.data.road_ahead import RoadAhead
-from mtlnet.export.openvino_graph import TOLERANCE
 from mtlnet.inference.engine import EngineKind, load_engine
 from mtlnet.inference.model_card import read_card
-from mtlnet.model.architecture import GRID
 from mtlnet.model.auxiliary import LABELS
+from mtlnet.openvino_graph import TOLERANCE
+from mtlnet.train import start_training
 from mtlnet.training.recipes import RECIPES
-from mtlnet.training.run import start_training
 from mtlnet.training.trainer import Trainer
 from trackfeatures.camera import CameraParameters
 

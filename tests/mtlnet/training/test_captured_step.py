@@ -1,4 +1,4 @@
-"""A recorded step of every recipe gives the weights of one that runs anew each time."""
+"""A recorded step of every recipe gives the same weights as a step that runs anew each time."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,21 +12,21 @@ from torch import Tensor
 import mtlnet.model.bins
 import mtlnet.training.trainer
 from datagen.recording import Dataset
+from mtlnet.architecture import GRID, GRID_RESIDUAL, MTL, Architecture, Conv
 from mtlnet.data.gpu_cache import GpuDataset, cache_if_it_fits
 from mtlnet.data.loader import Loader
 from mtlnet.data.road_ahead import RoadAhead
-from mtlnet.model.architecture import GRID, GRID_RESIDUAL, MTL, Architecture, Conv
 from mtlnet.training.cuda_graph import WARM_UP, CudaGraphStep
+from mtlnet.training.losses.task_weighting import TaskWeighting
 from mtlnet.training.optimizers import OptimizerSet
 from mtlnet.training.recipes import RECIPES, learning_rate
-from mtlnet.training.task_weighting import TaskWeighting
 from mtlnet.training.trainer import MIN_STEPS_BEFORE_BN_FREEZE, Trainer
 from tests.mtlnet.training.tape import Tape, TapeRecorder
 from trackfeatures.camera import CameraParameters
 
 CPU = torch.device("cpu")
 PROGRESS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.2, 0.61, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97)
-"""Of the steps taken; the statistics of batch normalisation are frozen from 0.6 (`fast`) or 0.8
+"""Progress of the steps; the statistics of batch normalisation are frozen from 0.6 (`fast`) or 0.8
 (`continue`) on."""
 CASES = [
     ("fast", GRID, "dwa"),
@@ -90,7 +90,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_replayed_step_is_the_step(
     dataset: Path, recipe: str, plan: Architecture, balance: str
 ) -> None:
-    """Rates, task weights and batches change with every step; Python runs in the first only."""
+    """Rates, task weights and batches change with every step; Python runs only in the first."""
     small = thin(plan)
     cached = cached_batches(dataset, CPU, small)
     plain, recorded = (build(recipe, small, balance, CPU, capturable=True) for _ in range(2))
@@ -145,7 +145,7 @@ def test_rates_are_kept_in_one_place_of_memory() -> None:
 
 @pytest.mark.parametrize("recipe", ["fast", "tune", "paper"])
 def test_steps_with_tensors_are_those_with_numbers(recipe: str) -> None:
-    """To the precision of float32, in which a tensor holds a rate."""
+    """Equal within the precision of float32, in which a tensor holds a rate."""
     ends = []
     for capturable in (False, True):
         trainer = build(recipe, thin(GRID), "fixed", CPU, capturable=capturable)

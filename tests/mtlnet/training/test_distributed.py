@@ -1,4 +1,4 @@
-"""Two processes train as one does."""
+"""Two processes train like one."""
 
 import subprocess
 import sys
@@ -10,9 +10,10 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+from mtlnet.architecture import find_architecture
 from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import WEIGHTS
-from mtlnet.model.architecture import find_architecture
+from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.distributed import (
     SINGLE_PROCESS,
@@ -22,7 +23,6 @@ from mtlnet.training.distributed import (
     read_rank,
 )
 from mtlnet.training.recipes import RECIPES
-from mtlnet.training.run import train
 from mtlnet.training.trainer import Trainer
 from trackfeatures.errors import UserError
 
@@ -64,7 +64,7 @@ def test_the_rank_is_read_from_the_environment_of_torchrun(monkeypatch: pytest.M
 
 def test_a_batch_that_does_not_divide_among_the_processes_is_refused() -> None:
     with (
-        pytest.raises(UserError, match="--batch 32 does not divide among 3 processes"),
+        pytest.raises(UserError, match="--batch 32 cannot be divided among 3 processes"),
         process_group(Rank(0, 3), torch.device("cpu"), 32),
     ):
         pass

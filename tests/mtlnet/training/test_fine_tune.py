@@ -10,20 +10,18 @@ import torch
 from safetensors.torch import save_file
 
 from datagen.recording import Dataset
-from mtlnet.data.sources import (
-    continue_from_model,
-    custom_training_data,
-    open_training_data,
-)
+from mtlnet.architecture import GRID
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.inference.prediction import decode_outputs, split_outputs
-from mtlnet.model.architecture import GRID
 from mtlnet.model.network import Network, initialise, load_network, predict_images
 from mtlnet.model.pretrained import load_pretrained
-from mtlnet.training.config import TrainConfig, open_pretrained
-from mtlnet.training.run import start_training, subnormals_as_zero
+from mtlnet.train import start_training
+from mtlnet.training.config import TrainConfig
+from mtlnet.training.configure import open_pretrained
+from mtlnet.training.device import subnormals_as_zero
+from mtlnet.training.sources import continue_from_model, custom_training_data, open_training_data
 from trackfeatures.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("short_fit")
@@ -48,7 +46,7 @@ def test_fine_tuning_starts_with_the_outputs_of_the_model(published: Path) -> No
     network = Network()
     network.target_mean.copy_(torch.linspace(0.2, 0.7, 6))
     network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
-    load_pretrained(network, published)
+    load_pretrained(network, published / WEIGHTS)
     frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
     expected = predict_images(load_network(published / WEIGHTS), frames)
     np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
@@ -60,7 +58,7 @@ def test_fine_tuning_a_network_with_bins_starts_with_its_outputs(tmp_path: Path)
     save_file(trained.state_dict(), tmp_path / WEIGHTS)
     network = Network(architecture=GRID)
     network.target_std.copy_(torch.linspace(0.02, 0.3, 6))  # set from the images, not used
-    load_pretrained(network, tmp_path)
+    load_pretrained(network, tmp_path / WEIGHTS)
     frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
     expected = predict_images(trained.eval(), frames)
     np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
@@ -97,7 +95,7 @@ def test_a_model_is_trained_on_with_batch_normalisation(
     assert (card.recipe, card.network, card.iterations) == ("continue", before.network, 12)
     assert card.data["init"]["model_hash"] == before.model_hash
     old, new = (load_network(run / WEIGHTS).state_dict() for run in (published, tmp_path / "run"))
-    # The first convolution stays, but for the batch statistics it is folded with.
+    # The first convolution stays, apart from the folded batch statistics.
     changed = {name for name in old if not torch.equal(old[name], new[name])}
     assert "features.conv2.layer.weight" in changed
     slopes = new["features.conv0.layer.weight"].flatten(1) / old[
@@ -187,7 +185,7 @@ def test_wrong_options_are_refused(
     pooled = TrainConfig(
         dataset, tmp_path / "d", recipe="continue", init="x", network="regnet_y_400mf"
     )
-    with pytest.raises(UserError, match="torchvision's networks cannot be put back"):
+    with pytest.raises(UserError, match="torchvision's networks cannot be restored"):
         open_training_data(pooled, replace(card, network="regnet_y_400mf"))
     drives = TrainConfig(
         dataset, tmp_path / "f", recipe="tune", init="x", network=card.network, hold_out_drives="a"
@@ -214,7 +212,7 @@ def test_the_card_lists_the_seeds_and_tracks_of_both_trainings(
 
 
 def test_numbers_too_small_for_the_processor_are_zero_in_training_alone() -> None:
-    """Else the momenta of units that seldom learn make a step take twice as long."""
+    """Otherwise the momenta of units that seldom learn make a step take twice as long."""
 
     def product() -> float:
         return float((torch.full((8,), 1e-37) * 1e-3).max())
@@ -229,7 +227,7 @@ def test_numbers_too_small_for_the_processor_are_zero_in_training_alone() -> Non
 def test_a_single_image_is_enough(
     count: int, alike: bool, published: Path, custom_images: Path, tmp_path: Path
 ) -> None:
-    """Also two, and three copies of one; in batches of one, which `tune` allows."""
+    """Also with two images, and three copies of one; in batches of one, which `tune` allows."""
     table = custom_images / "labels.csv"
     table.write_text("\n".join(table.read_text().splitlines()[: count + 1]) + "\n")
     for number in range(1, count if alike else 1):

@@ -13,10 +13,11 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 import runtime.files
 from mtlnet.inference.curves import COLUMNS, read_curves
 from mtlnet.inference.model_card import ModelError, read_card
+from mtlnet.train import train
 from mtlnet.training.checkpoint import list_checkpoints
-from mtlnet.training.config import TrainConfig, resume_config
+from mtlnet.training.config import TrainConfig
+from mtlnet.training.configure import resume_config
 from mtlnet.training.logging import CurveLog, TensorBoardWriter
-from mtlnet.training.run import train
 from runtime.files import atomic_write
 from trackfeatures.errors import UserError
 
@@ -104,7 +105,7 @@ def test_a_run_can_be_resumed_after_the_disk_was_full(
     new = config(dataset, tmp_path / "run")
     first = config(dataset, tmp_path / "run", iterations=1)
     with monkeypatch.context() as patch:
-        patch.setattr("mtlnet.training.run.finish", lambda *_: None)
+        patch.setattr("mtlnet.train.finish", lambda *_: None)
         with pytest.raises(ModelError, match="no finished model"):
             train(first, None)
     kept = [path.name for path in list_checkpoints(new.out)]

@@ -1,4 +1,4 @@
-"""On a GPU batches are larger and rates scaled; a run goes on with them on any device."""
+"""On a GPU batches are larger and rates are scaled; a run keeps them on any device."""
 
 import math
 from pathlib import Path
@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from datagen.recording import Dataset
-from mtlnet.data.sources import recorded_training_data
-from mtlnet.training.config import new_config, resume_config, write_config
+from mtlnet.training.configure import new_config, resume_config, write_config
 from mtlnet.training.distributed import SINGLE_PROCESS
 from mtlnet.training.recipes import RECIPES, learning_rate_factor
 from mtlnet.training.run import prepare
+from mtlnet.training.sources import recorded_training_data
 from tests.mtlnet.conftest import training_config
 
 

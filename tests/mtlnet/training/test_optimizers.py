@@ -47,7 +47,7 @@ def test_muon_trains_the_convolutions_and_the_first_shared_layer() -> None:
 
 
 def test_adamw_trains_layers_that_are_too_large_for_muon() -> None:
-    """The 4096 rows of network `deepdriving` would take Muon twenty seconds a step."""
+    """With the 4096 rows of network `deepdriving` Muon would take twenty seconds per step."""
     layer = "shared.fc0.layer.weight"
     at_most = torch.empty(MUON_MAX_SIDE, 4 * MUON_MAX_SIDE, device="meta")
     assert uses_muon(layer, at_most)
@@ -78,7 +78,7 @@ def test_the_singular_values_of_a_muon_step_are_nearly_equal() -> None:
 
 @pytest.mark.parametrize("shape", [(96, 363), (384, 3456), (512, 64)])
 def test_steps_equal_those_of_torchs_muon(shape: tuple[int, int]) -> None:
-    """To the precision of torch, which rounds each of ten products to bf16 (8 bits)."""
+    """Equal within the precision of torch, which rounds each of ten products to bf16 (8 bits)."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(shape, generator=generator)
     ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))

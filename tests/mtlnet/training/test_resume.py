@@ -1,10 +1,13 @@
-"""A run that was stopped or killed goes on, and its weights are those of an uninterrupted one."""
+"""A stopped or killed run continues, and its weights are those of an uninterrupted one."""
 
 import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +19,10 @@ from datagen.recording import Dataset
 from mtlnet.export.ship import _without_folders
 from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
+from mtlnet.train import train
 from mtlnet.training.checkpoint import list_checkpoints
-from mtlnet.training.config import resume_config
+from mtlnet.training.configure import resume_config
 from mtlnet.training.loop import Stopped
-from mtlnet.training.run import train
 from runtime.files import locked_folder
 from tests.mtlnet.conftest import training_config, write_dataset
 from trackfeatures.errors import UserError
@@ -27,22 +30,9 @@ from trackfeatures.errors import UserError
 pytestmark = pytest.mark.usefixtures("short_fit")
 
 
-class StopAt:
-    """A stop request after so many steps: `requested` is read once before each of them."""
-
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-
-    @property
-    def requested(self) -> bool:
-        self.steps -= 1
-        return self.steps < 0
-
-    def __enter__(self) -> "StopAt":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return
+def stop_after(steps: int) -> Callable[..., AbstractContextManager[Callable[[], bool]]]:
+    """Replaces `interrupts`: a stop is requested after this many steps; read before each step."""
+    return lambda *_: nullcontext(chain(repeat(False, steps), repeat(True)).__next__)
 
 
 @pytest.mark.parametrize(
@@ -52,12 +42,12 @@ class StopAt:
 def test_a_resumed_run_equals_an_uninterrupted_one(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str, balance: str
 ) -> None:
-    monkeypatch.setattr("mtlnet.training.task_weighting.WINDOW_STEPS", 1)
+    monkeypatch.setattr("mtlnet.training.losses.task_weighting.WINDOW_STEPS", 1)
     monkeypatch.setattr("mtlnet.training.loop.LOG_EVERY", 1)
     train(training_config(dataset, tmp_path / "whole", recipe=recipe, balance=balance), None)
     broken = training_config(dataset, tmp_path / "broken", recipe=recipe, balance=balance)
     with monkeypatch.context() as patch:
-        patch.setattr(mtlnet.training.loop, "StopRequest", lambda: StopAt(2))
+        patch.setattr(mtlnet.training.loop, "interrupts", stop_after(2))
         with pytest.raises(Stopped, match="step-00000002"):
             train(broken, None)
     with pytest.raises(ModelError, match="no finished model"):
@@ -78,7 +68,7 @@ def differing_weights(one: Path, other: Path) -> list[str]:
 
 
 def weights_in(run: Path) -> list[list[float]]:
-    """The tasks' weights along a run."""
+    """The task weights during a run."""
     names = ("distance_weight", "angle_weight", "type_weight")
     return [[point[name] for name in names] for point in read_curves(run / "curves.csv")]
 
@@ -86,7 +76,7 @@ def weights_in(run: Path) -> list[list[float]]:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-import mtlnet.training.loop, mtlnet.training.run, runtime.files
+import mtlnet.train, mtlnet.training.loop, runtime.files
 from mtlnet.training.config import TrainConfig
 sync, seen = os.fsync, []
 def die(file):
@@ -97,7 +87,7 @@ runtime.files.os.fsync = die
 mtlnet.training.loop.CHECKPOINT_SECONDS = 0.0
 data, out = map(Path, sys.argv[1:])
 given = {"iterations": 6, "batch": 4, "seed": 7, "device": "cpu", "threads": 1}
-mtlnet.training.run.train(TrainConfig(data, out, **given), None)
+mtlnet.train.train(TrainConfig(data, out, **given), None)
 """
 
 
@@ -121,7 +111,7 @@ def test_a_run_resumed_with_more_iterations_and_stopped_again_goes_on_to_them(
 ) -> None:
     run = training_config(dataset, tmp_path / "run", iterations=2)
     with monkeypatch.context() as patch:
-        patch.setattr(mtlnet.training.loop, "StopRequest", lambda: StopAt(1))
+        patch.setattr(mtlnet.training.loop, "interrupts", stop_after(1))
         with pytest.raises(Stopped):
             train(run, None)
         with pytest.raises(Stopped):
@@ -170,7 +160,7 @@ def test_a_run_continues_on_other_data_if_told_to(dataset: Path, tmp_path: Path)
     assert changed["earlier"] == [kept]
     assert changed["content_hash"] == Dataset.open(other_dataset).content_hash
     assert set(changed["seeds"]) > set(first["seeds"])
-    # From now on the run's data is the other dataset, and its past is not forgotten.
+    # From now on the other dataset is the run's data; the earlier one stays in its history.
     resumed, data = resume_config(run.out, {"iterations": 3})
     assert resumed.data == other_dataset
     assert not resumed.change_data
@@ -201,7 +191,8 @@ def test_a_run_from_a_model_continues_on_other_data_and_names_that_model(
 
 @pytest.mark.usefixtures("small_network")
 def test_a_run_is_resumed_though_its_model_has_been_replaced(dataset: Path, tmp_path: Path) -> None:
-    """As `default` is by a new version. Without a checkpoint the run would need the old weights."""
+    """The name of a model may stand for another one later, as `default` after an update. Without a
+    checkpoint the run would need the old weights."""
     train(training_config(dataset, tmp_path / "model", iterations=1), None)
     options = {"recipe": "continue", "init": str(tmp_path / "model"), "iterations": 1}
     run = training_config(dataset, tmp_path / "run", **options)

@@ -17,10 +17,11 @@ from mtlnet.data.loader import Loader
 from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
 from mtlnet.model.cpu_kernels.forward import training_outputs
+from mtlnet.train import train
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.loop import TrainProgress
 from mtlnet.training.recipes import RECIPES, learning_rate
-from mtlnet.training.run import require_new, train
+from mtlnet.training.run import require_new
 from mtlnet.training.trainer import Trainer
 from tests.mtlnet.conftest import training_config
 from trackfeatures.camera import CameraParameters
@@ -147,11 +148,14 @@ def test_a_run_limited_by_time_ends(dataset: Path, tmp_path: Path) -> None:
     started = time.monotonic()
     card = train(run, None)
     assert card.iterations >= 1
-    assert 1.0 <= time.monotonic() - started < 60.0  # a second of steps; then it is published
+    assert (
+        1.0 <= time.monotonic() - started < 60.0
+    )  # one second of steps, then the model is published
 
 
 def test_a_folder_that_a_kill_has_left_empty_is_new(tmp_path: Path) -> None:
-    """Killed before config.json, neither the same command nor --resume would go on."""
+    """Killed before config.json was written, when neither the same command nor --resume would
+    work."""
     run = tmp_path / "run"
     run.mkdir()
     require_new(run)
@@ -193,10 +197,8 @@ def test_learning_rate_schedules() -> None:
 
 
 def test_a_run_of_continue_can_be_prolonged_until_its_rate_falls() -> None:
-    """Minutes added within the first four fifths leave the rates of the steps so far as they are.
-
-    100 steps a minute; planned for 20 minutes, or for 200.
-    """
+    """Minutes added within the first four fifths do not change the rates of earlier steps: 100
+    steps per minute, planned for 20 minutes or for 200."""
     recipe = RECIPES["continue"]
     planned, prolonged = (
         [learning_rate(recipe, step, step / 100 / minutes) for step in range(0, 20 * 100, 50)]

@@ -49,7 +49,8 @@ def zero_pitch_layers() -> dict[str, np.ndarray]:
 def fitted(
     seed: int, count: int, of: int
 ) -> tuple[UncertaintyHead, np.ndarray, np.ndarray, np.ndarray]:
-    """A head fitted to errors of known deviations; x, deviations and errors of other frames."""
+    """A head fitted to errors of known deviations; inputs, deviations and errors of other
+    frames."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(count + of, 6)).astype(np.float32)
     true = np.exp(0.5 * x[:, :1] - 2 + 0.2 * np.arange(7))

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mtlnet.inference.model_card import ModelError, golden_image
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import ModelError
 from serve.scheduling.warmup import warm_up
 from tests.serve.conftest import CARD, FakeEngine, Served, assert_problem, serving, until
 

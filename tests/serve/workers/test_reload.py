@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.model_card import golden_image, read_card
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import read_card
 from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client
 from tests.serve.conftest import PATIENCE_S, png, publish_untrained, until

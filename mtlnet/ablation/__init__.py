@@ -1,0 +1,1 @@
+"""`mtlnet ablate`: the paper's ablation table."""

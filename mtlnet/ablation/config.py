@@ -1,0 +1,54 @@
+"""The configuration of an ablation: its fields are options of `mtlnet ablate`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Option
+
+import trackfeatures as tf
+from mtlnet.training.recipes import find_recipe
+from trackfeatures.errors import UserError
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds from "1,2,3". Raises UserError when one is not a non-negative integer."""
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isascii() and part.isdigit() for part in parts):
+        raise UserError(f"--seeds {text!r} is not a list of whole numbers; give them as 1,2,3")
+    return tuple(int(part) for part in parts)
+
+
+@dataclass(frozen=True)
+class AblationConfig:
+    """One ablation. Only `seeds`, `device` and `threads` may change when it is continued."""
+
+    out: Annotated[Path, Option(help="Folder of the ablation; an existing one is continued.")]
+    iterations: Annotated[int, Option(help="Number of training steps of every run.")]
+    data: Annotated[Path, Option(help="Dataset folder.")] = Path("datasets/default")
+    seeds: Annotated[
+        tuple[int, ...],
+        Option(
+            parser=parse_seeds,
+            metavar="TEXT",
+            help="Seeds, separated by commas; every row is trained once with each.",
+        ),
+    ] = (1, 2, 3)
+    recipe: Annotated[str, Option(help="Training recipe: fast or paper.")] = "fast"
+    batch: Annotated[int, Option(help="Images per step.")] = 32
+    split: Annotated[str, Option(help="Rounds to evaluate on: test or unseen.")] = "test"
+    every: Annotated[int, Option(help="Evaluate only every n-th frame.", min=1)] = 5
+    device: Annotated[
+        str, Option(help="Device: auto (a GPU if there is one), cpu, cuda or cuda:NUMBER.")
+    ] = "auto"
+    threads: Annotated[int, Option(help="Number of CPU threads; 0: one per core.")] = 0
+
+    def __post_init__(self) -> None:
+        find_recipe(self.recipe)
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise UserError(f"--seeds {self.seeds} must be different numbers, at least one")
+
+    def shared_settings(self) -> dict[str, Any]:
+        """The settings that must be equal for runs to be comparable."""
+        same = ("iterations", "recipe", "batch", "split", "every")
+        return {"definitions": tf.VERSION, **{name: getattr(self, name) for name in same}}

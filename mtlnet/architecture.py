@@ -1,0 +1,241 @@
+"""Architectures of the networks, layer by layer; free of torch.
+
+`mtl`: the paper's network (section IV-C), with TensorFlow's SAME padding.
+
+`deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), with which the paper compares:
+AlexNet with a fourth fully connected layer, trained on one task, the regression of coded values.
+Layers, padding and local response normalisation are those of the authors' Caffe model. Deviations:
+the outputs are our six coded values instead of their fourteen, and linear, without a sigmoid; no
+mean image is subtracted; training uses our recipes. It has no classifier: each class has
+probability one third.
+
+`grid`: five convolutions that keep a grid of 9 x 18 places, where the paper's end in one place; its
+outputs are distributions over bins (`mtlnet.model.bins`). The rows of the sky are not read. In
+training, auxiliary heads read the positions of the lane's markings from the grid and the curvature
+ahead from the shared features (`mtlnet.model.auxiliary`).
+
+`grid_residual`: `grid` with six residual convolutions more, for long trainings; it can start from a
+trained `grid` (`mtlnet.model.pretrained`).
+
+`mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
+weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
+"""
+
+from dataclasses import dataclass, replace
+
+from trackfeatures.errors import UserError
+
+HEIGHT, WIDTH = 210, 280
+
+
+@dataclass(frozen=True)
+class Conv:
+    """Conv(n, k, s) of the paper: n filters of k x k, stride s, then ReLU; `pad` None: SAME
+    padding.
+
+    `skip`: the input is added to the output (a residual connection, He et al. 2015).
+    """
+
+    filters: int
+    kernel: int
+    stride: int
+    pad: int | None = None
+    groups: int = 1
+    skip: bool = False
+
+
+@dataclass(frozen=True)
+class Pool:
+    """MaxPool(k, s), with SAME padding as in the paper, or as in Caffe, which rounds sizes up."""
+
+    kernel: int = 3
+    stride: int = 2
+    same: bool = True
+
+
+@dataclass(frozen=True)
+class LocalNorm:
+    """AlexNet's local response normalisation over neighbouring channels (Krizhevsky 2012)."""
+
+    size: int = 5
+    alpha: float = 1e-4
+    beta: float = 0.75
+
+
+Layer = Conv | Pool | LocalNorm
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """One network: layers or a torchvision backbone, then shared fully connected layers."""
+
+    name: str
+    features: tuple[Layer, ...]
+    shared: tuple[int, ...]
+    tasks: tuple[str, ...] = ("distance", "angle", "heading")
+    backbone: str = ""
+    """Name of the torchvision model that computes the features; empty: `features` are the layers.
+    """
+    bins: bool = False
+    """Whether the outputs are distributions over bins instead of the paper's coded values."""
+    first_row: int = 0
+    """Index of the first image row that is read."""
+
+    @property
+    def default_alpha(self) -> tuple[float, float, float]:
+        """Task weights: those of the paper's MTL 3, or equal weights for a network without a
+        classifier."""
+        return (0.3, 0.2, 0.5) if "heading" in self.tasks else (1.0, 1.0, 0.0)
+
+    @property
+    def heads(self) -> tuple[tuple[str, int], ...]:
+        """Name and number of outputs of each head."""
+        return BIN_HEADS if self.bins else HEADS
+
+    @property
+    def keeps_places(self) -> bool:
+        """Whether the last features form a grid of places in the image instead of a single
+        place."""
+        return bool(self.features) and grid_size(self)[1] > 1
+
+    @property
+    def uncertainty_inputs(self) -> int:
+        """Number of inputs of the uncertainty head: features and, with heads over bins, six
+        spreads."""
+        return self.shared[-1] + (6 if self.bins else 0)
+
+    @property
+    def convolutions(self) -> tuple[str, ...]:
+        """Submodule names of the convolutions, in order; none for a torchvision backbone."""
+        each = enumerate(self.features)
+        return tuple(f"conv{number}" for number, spec in each if isinstance(spec, Conv))
+
+
+FEATURES: tuple[Conv | Pool, ...] = (
+    Conv(96, 11, 4),
+    Pool(),
+    Conv(256, 5, 2),
+    Pool(),
+    Conv(384, 3, 2),
+    Conv(384, 3, 2),
+    Conv(256, 3, 2),
+    Pool(),
+)
+SHARED = (4096, 1024, 256)
+HEADS = (("distance", 5), ("angle", 1), ("heading", 3))
+DISTANCE_BINS, ANGLE_BINS = 70, 100
+"""Number of bins of a distance (besides one for "absent") and of the angle."""
+NEAR = 4
+"""The answer is the expectation over the bins within this distance of the likeliest bin."""
+BIN_VARIANCE = 1 / 12
+"""Variance of a uniform distribution over one bin."""
+PAIR = slice(0, 2)
+"""`ml` and `mr`, which are present or absent together: the two sides of the car's lane."""
+ABSENT_ABOVE = (0.54, 0.54, 0.75, 0.54, 0.75)
+"""Probabilities above which `ml`, `mr`, `l`, `m` and `r` are answered as absent, chosen on held-out
+frames (docs/experiments/uncertainty.md). A wrongly absent marking counts as an error of 4 to 5 m,
+and `l` and `r` are absent in 70 % of the frames. With 0.5 their mean error is larger by half; with
+0.9 a model of few steps answers the offset from the lane's centre worse."""
+BIN_HEADS = (("distance", 5 * (DISTANCE_BINS + 1)), ("angle", ANGLE_BINS), ("heading", 3))
+ALEXNET: tuple[Layer, ...] = (
+    Conv(96, 11, 4, pad=0),
+    Pool(same=False),
+    LocalNorm(),
+    Conv(256, 5, 1, pad=2, groups=2),
+    Pool(same=False),
+    LocalNorm(),
+    Conv(384, 3, 1, pad=1),
+    Conv(384, 3, 1, pad=1, groups=2),
+    Conv(256, 3, 1, pad=1, groups=2),
+    Pool(same=False),
+)
+GRID_FEATURES = (
+    Conv(64, 12, 4, pad=4),
+    Conv(128, 3, 2, pad=1),
+    Conv(192, 3, 2, pad=1),
+    Conv(192, 3, 1, pad=1),
+    Conv(32, 1, 1, pad=0),
+)
+RESIDUAL_FEATURES = (
+    Conv(64, 12, 4, pad=4),
+    Conv(128, 3, 2, pad=1),
+    *(Conv(128, 3, 1, pad=1, skip=True),) * 2,
+    Conv(192, 3, 2, pad=1),
+    Conv(192, 3, 1, pad=1),
+    *(Conv(192, 3, 1, pad=1, skip=True),) * 4,
+    Conv(32, 1, 1, pad=0),
+)
+MTL = Architecture("mtl", FEATURES, SHARED)
+GRID = Architecture("grid", GRID_FEATURES, (512, 256, 256), bins=True, first_row=66)
+GRID_RESIDUAL = replace(GRID, name="grid_residual", features=RESIDUAL_FEATURES)
+ARCHITECTURES = {
+    architecture.name: architecture
+    for architecture in (
+        MTL,
+        Architecture("deepdriving", ALEXNET, (4096, 4096, 256), tasks=("distance", "angle")),
+        Architecture("mobilenet_v3_small", (), (256,), backbone="mobilenet_v3_small"),
+        Architecture("regnet_y_400mf", (), (256,), backbone="regnet_y_400mf"),
+        GRID,
+        GRID_RESIDUAL,
+    )
+}
+HEAD_KINDS = ("coded", "bins")
+"""Kinds of heads: the paper's coded values, or distributions over bins."""
+ARCHITECTURES |= {
+    f"{base.name}-{kind}": replace(base, name=f"{base.name}-{kind}", bins=kind == "bins")
+    for base in list(ARCHITECTURES.values())
+    for kind in HEAD_KINDS
+    if base.bins != (kind == "bins")
+}  # each with the other heads: `mtl-bins`, ..., `grid-coded`
+
+
+def find_architecture(name: str) -> Architecture:
+    """The architecture with this name. Raises UserError for an unknown name."""
+    if name not in ARCHITECTURES:
+        names = [name for name in ARCHITECTURES if not name.endswith(HEAD_KINDS)]
+        raise UserError(f"there is no network {name!r}; choose one of {', '.join(names)}")
+    return ARCHITECTURES[name]
+
+
+def with_heads(name: str, kind: str) -> str:
+    """Name of network `name` with heads of `kind`, one of `HEAD_KINDS`. Raises UserError."""
+    if kind not in HEAD_KINDS:
+        raise UserError(f"--heads {kind!r} is unknown; give {' or '.join(HEAD_KINDS)}")
+    base = name.removesuffix("-bins").removesuffix("-coded")
+    return base if find_architecture(base).bins == (kind == "bins") else f"{base}-{kind}"
+
+
+def require_task_heads(architecture: Architecture, alpha: tuple[float, float, float]) -> None:
+    """Raise UserError when `alpha` gives weight to a task for which the network has no head."""
+    if alpha[2] > 0 and "heading" not in architecture.tasks:
+        raise UserError(
+            f"network {architecture.name} has no class, so alpha's third weight must be 0, not "
+            f"{alpha[2]:g}; give for example --alpha 1,1,0"
+        )
+
+
+def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
+    """TensorFlow's SAME padding: (output size, zeros before, zeros after)."""
+    out = -(-size // stride)
+    total = max((out - 1) * stride + kernel - size, 0)
+    return out, total // 2, total - total // 2
+
+
+def grid_size(architecture: Architecture) -> tuple[int, int, int]:
+    """Channels, rows and columns of the last features."""
+    channels, height, width = 3, HEIGHT - architecture.first_row, WIDTH
+    for spec in architecture.features:
+        height, width = output_size(height, spec), output_size(width, spec)
+        channels = spec.filters if isinstance(spec, Conv) else channels
+    return channels, height, width
+
+
+def output_size(size: int, layer: Layer) -> int:
+    """Number of output rows (or columns) of a layer for `size` input rows (or columns)."""
+    if isinstance(layer, LocalNorm):
+        return size
+    if isinstance(layer, Conv) and layer.pad is not None:
+        return (size + 2 * layer.pad - layer.kernel) // layer.stride + 1
+    if isinstance(layer, Pool) and not layer.same:
+        return -(-(size - layer.kernel) // layer.stride) + 1
+    return same_padding(size, layer.kernel, layer.stride)[0]

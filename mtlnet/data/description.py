@@ -1,0 +1,60 @@
+"""The description of training data in a model's card, and the mean of its labels: the baseline."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import trackfeatures as tf
+from datagen.recording import Dataset, Frames
+from mtlnet.data.loader import LabelArrays
+from trackfeatures.definitions import UNKNOWN_HEADING
+
+
+def describe_data(
+    dataset: Dataset, frames: Frames, held_out: Frames | None = None
+) -> dict[str, Any]:
+    """Description of a model's training data; `mean`, the mean of the labels, is the baseline.
+
+    `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks are
+    listed as seen by the model; `frames` does not include their frames.
+    """
+    rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
+    splits = {
+        split: [info.id for info in dataset.rounds if info.split == split]
+        for split in ("train", "test")
+    }
+    return {
+        "path": str(dataset.path),
+        "content_hash": dataset.content_hash,
+        "frames": len(frames),
+        "split": splits,
+        "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
+        "seeds": [info.seed for info in rounds],
+        "tracks": sorted({info.track for info in rounds}),
+        "mean": mean_labels(frames.labels),
+    }
+
+
+def mean_labels(labels: LabelArrays) -> dict[str, Any]:
+    """Mean of the labels and their most frequent class; None for markings that are never
+    present."""
+    distances = nan_where_unknown(labels.distances.astype(np.float64))
+    counts = (~np.isnan(distances)).sum(0)
+    sums = np.nansum(distances, axis=0)
+    offset = nan_where_unknown(tf.localise(distances))
+    known = labels.heading[labels.heading != UNKNOWN_HEADING]
+    classes = np.bincount(known, minlength=len(tf.RoadClass))
+    return {
+        "distances_m": [float(s / n) if n else None for s, n in zip(sums, counts, strict=True)],
+        "to_lane_centre_m": float(np.nanmean(offset)) if not np.isnan(offset).all() else 0.0,
+        "angle_rad": float(labels.angle.astype(np.float64).mean()),
+        "heading": int(classes.argmax()),
+        "heading_share": [float(share) for share in classes / max(classes.sum(), 1)],
+    }
+
+
+def nan_where_unknown(metres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`metres` with NaN in place of infinity, which marks an unknown label
+    (`trackfeatures.coding`)."""
+    return np.where(np.isinf(metres), np.nan, metres)

@@ -1,0 +1,131 @@
+"""Recorded rounds as training data: opening them, holding some out, finding undecodable frames."""
+
+import hashlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
+from mtlnet.architecture import HEIGHT, WIDTH
+from mtlnet.inference.model_card import ModelCard, ModelError
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+HELD_OUT_SHARE = 1 / 12
+MIN_ROUNDS_TO_HOLD_OUT = 8
+"""No round is held out if there are fewer train rounds."""
+CHUNK = 64  # images decoded at a time
+MAX_NAMED = 5  # undecodable images named in a message
+
+
+def open_training_dataset(path: Path) -> Dataset:
+    """The dataset in folder `path`. Raises UserError when its images do not fit the network."""
+    dataset = Dataset.open(path)
+    camera = dataset.camera
+    if (camera.width, camera.height) != (WIDTH, HEIGHT):
+        raise UserError(
+            f"the images of {path} are {camera.width} x {camera.height}, the network takes "
+            f"{WIDTH} x {HEIGHT}; collect with the default camera size"
+        )
+    if not camera.is_plain:
+        raise UserError(
+            f"the images of {path} are of a camera ({camera}) with distortion, roll, yaw or a "
+            "matrix of its own, which a network is not trained on; collect without --camera, or "
+            "with a fov_y_deg alone: pictures of any lens are warped into the model's camera"
+        )
+    dataset.select("train")  # raises where there are none
+    return dataset
+
+
+def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
+    """Divide the train rounds of a dataset into those to train on and those held out.
+
+    The held-out rounds are for fitting the uncertainty head. The division depends only on the set
+    of rounds; rounds whose track and lights are rare among the rounds held out so far are chosen
+    first.
+    """
+    rounds = [info for info in dataset.rounds if info.split == "train"]
+    conditions = {info.id: {info.track, *info.lights} for info in rounds}
+    if len(conditions) < MIN_ROUNDS_TO_HOLD_OUT:
+        return dataset.select("train"), None
+    held_out: list[str] = []
+    order = sorted(conditions, key=lambda name: hashlib.sha256(name.encode()).digest())
+    for _ in range(round(len(conditions) * HELD_OUT_SHARE) or 1):
+        seen = [condition for name in held_out for condition in conditions[name]]
+        left = [name for name in order if name not in held_out]
+        held_out.append(min(left, key=lambda name: sum(seen.count(c) for c in conditions[name])))
+    kept = [name for name in conditions if name not in held_out]
+    return select_rounds(dataset, kept), select_rounds(dataset, held_out)
+
+
+def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
+    """The frames of the rounds with these ids."""
+    chosen = [i for i, info in enumerate(dataset.rounds) if info.id in names]
+    return Frames(
+        [dataset.rounds[i] for i in chosen], [dataset.indexes[i] for i in chosen], dataset.camera
+    )
+
+
+def require_camera(card: ModelCard, camera: CameraParameters) -> None:
+    """Raise ModelError when `camera`, that of the data, differs from the model's."""
+    found, expected = camera.as_dict(), card.camera.as_dict()
+    if found != expected:
+        differing = ", ".join(
+            f"{k} {found[k]:g} instead of {expected[k]:g}"
+            for k in expected
+            if found[k] != expected[k]
+        )
+        raise ModelError(
+            f"the camera of the data is not that of model {card.name}: {differing}; collect with "
+            "the model's camera, or train a model for this one"
+        )
+
+
+def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
+    """The errors of all frames with a damaged image or label, by row; decodes every frame."""
+    images = np.empty((CHUNK, frames.camera.height, frames.camera.width, 3), np.uint8)
+    found: dict[int, UndecodableImage] = {}
+    for first in range(0, len(frames), CHUNK):
+        rows = np.arange(first, min(first + CHUNK, len(frames)))
+        with suppress(UndecodableImage):
+            frames.read_batch(rows, images[: len(rows)])
+            for row in rows.tolist():
+                frames.require_label(row)
+            continue
+        for row in rows.tolist():
+            try:
+                frames.image(row)
+                frames.require_label(row)
+            except UndecodableImage as error:
+                found[row] = error
+    return found
+
+
+def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) -> None:
+    """Decode all frames; raise DatasetError with the number and names of the undecodable ones.
+
+    `skippable`: whether the command has the option --skip-undecodable.
+    """
+    found = list(find_undecodable(frames).values())
+    if not found:
+        return
+    named = ", ".join(f"image {e.frame} of round {e.round_id}" for e in found[:MAX_NAMED])
+    more = f" and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
+    skip = ", or leave these frames out with --skip-undecodable" if skippable else ""
+    raise DatasetError(
+        f"{len(found)} of {len(frames)} images in {data} cannot be decoded: {named}{more} "
+        f"({found[0].reason}); record those rounds again{skip}"
+    )
+
+
+def drop_undecodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
+    """`frames` without the undecodable ones, and the names of these.
+
+    Raises DatasetError when no frame is left.
+    """
+    found = find_undecodable(frames)
+    if len(found) == len(frames):
+        require_decodable(frames, data)
+    names = [f"{error.round_id}/{error.frame}" for error in found.values()]
+    return frames.without(found) if found else frames, names

@@ -1,0 +1,1 @@
+"""Sources of images: files, folders, films, recorded rounds, other recordings, webcams, streams."""

@@ -1,0 +1,127 @@
+"""Collects the errors that FFmpeg reports while OpenCV decodes a film.
+
+OpenCV hides decoding errors: frames that FFmpeg has patched look like others. They are reported
+only in FFmpeg's log, which by default goes to stderr.
+"""
+
+import atexit
+import ctypes
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+AV_LOG_ERROR = 16
+LINE_BYTES = 512
+# Messages about data other than pictures, which dash cameras write freely, and about the end of a
+# stream of unknown size.
+HARMLESS = ("SEI", "APP fields", "timescale not set", f"should be {2**64 - 1}")
+SIZES = (b"Reinit context to %dx%d", b"sof0: picture: %dx%d")
+SIZE = re.compile(r"(?:to|picture:) (\d+)x(\d+)")
+BLOCK_PX = 16
+PREFIX = re.compile(r"^(?:\[(\S+) @ [^]]+\] )+")  # e.g. "[h264 @ 0x55d0] "
+CONVERTER = "swscaler"
+LogCallback = ctypes.CFUNCTYPE(
+    None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p
+)
+
+
+@dataclass
+class DecodingErrors:
+    """Number of errors so far, and the text of the first.
+
+    `unconverted`: text of an error in the conversion to RGB, after which OpenCV returns a black
+    picture. `size`: coded size (width, height) of later pictures, if a decoder of H.264 or MJPEG
+    reports one; OpenCV scales these pictures to the size of the first.
+    """
+
+    count: int = 0
+    first: str = ""
+    unconverted: str = ""
+    size: tuple[int, int] | None = None
+
+    def forget(self) -> None:
+        """Forget the errors so far."""
+        self.count, self.first, self.unconverted, self.size = 0, "", "", None
+
+    def new_size(self, shape: tuple[int, ...]) -> tuple[int, int] | None:
+        """The new size (width, height) of pictures if it changed; `shape` (H, W, 3) is the first
+        picture's.
+
+        A coded size is a multiple of `BLOCK_PX`; that of a rotated film is rotated.
+        """
+        if self.size is None:
+            return None
+        fits = (
+            0 <= c - s < BLOCK_PX for c, s in zip(sorted(self.size), sorted(shape[:2]), strict=True)
+        )
+        return None if all(fits) else self.size
+
+    def add(self, line: str) -> None:
+        """Count a line of the log, for example "[h264 @ 0x55d0] Reference 2 >= 2"."""
+        found = PREFIX.match(line)
+        text = " ".join(line[found.end() if found else 0 :].split())
+        if any(part in text for part in HARMLESS):
+            return
+        if found and found[1] == CONVERTER:
+            self.unconverted = text
+        self.first = self.first or text
+        self.count += 1
+
+
+@contextmanager
+def decoding_errors() -> Iterator[DecodingErrors]:
+    """Collect the errors of all films that are decoded within the context.
+
+    None are collected where FFmpeg's library is not found.
+    """
+    found = DecodingErrors()
+    library = _library()
+    if library is None:
+        yield found
+        return
+
+    def add(context: int, level: int, text: bytes, arguments: int) -> None:
+        is_size = level > AV_LOG_ERROR and text.startswith(SIZES)
+        if level <= AV_LOG_ERROR or is_size:
+            line = ctypes.create_string_buffer(LINE_BYTES)
+            library.av_log_format_line(
+                ctypes.c_void_p(context), level, text, ctypes.c_void_p(arguments), line, LINE_BYTES,
+                ctypes.byref(ctypes.c_int(1)),
+            )  # fmt: skip
+            told = line.value.decode(errors="replace")
+            if not is_size:
+                found.add(told)
+            elif size := SIZE.search(told):
+                found.size = (int(size[1]), int(size[2]))
+
+    callback = LogCallback(add)  # must outlive its use
+    library.av_log_set_callback(callback)
+    try:
+        yield found
+    finally:
+        _restore()
+
+
+def _restore() -> None:
+    library = _library()
+    if library is not None:
+        library.av_log_set_callback(library.av_log_default_callback)
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL | None:
+    """The libavutil that OpenCV has loaded; None if there is none."""
+    import cv2  # noqa: F401  # loads it
+
+    try:
+        lines = Path("/proc/self/maps").read_text(errors="surrogateescape").splitlines()
+    except OSError:
+        return None
+    paths = [line.split(maxsplit=5)[-1] for line in lines if "/libavutil" in line]
+    if not paths:
+        return None
+    atexit.register(_restore)  # threads of a decoder may outlive the interpreter
+    return ctypes.CDLL(paths[0])

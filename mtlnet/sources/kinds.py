@@ -1,0 +1,103 @@
+"""The kind of a file: image, film, recorded round or other recording.
+
+Determined by its first bytes, or else by its name.
+"""
+
+from contextlib import suppress
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mtlnet.inference.image_decoding.other_kinds import SUFFIXES
+
+
+class Kind(Enum):
+    """Kind of a source of images."""
+
+    IMAGE = "image"
+    FILM = "film"
+    ROUND = "round"
+    RECORDING = "recording"
+    """Recording of another program: an MCAP file of Foxglove or ROS 2, a ROS 2 bag."""
+    STREAM = "stream"
+    """Webcam or stream."""
+
+
+IMAGES = tuple(suffix for suffix in SUFFIXES if suffix != ".gif")  # a GIF is read as a film
+# fmt: off
+FILMS = (
+    ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg",
+    ".vob", ".wmv", ".asf", ".flv", ".3gp", ".3g2", ".ogv", ".gif", ".y4m", ".mjpeg", ".mjpg",
+    ".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".qcamera",
+    ".mxf", ".nut", ".ivf", ".dv", ".gxf", ".wtv", ".rm",
+)
+# fmt: on
+MJPEG = (".mjpeg", ".mjpg")  # they begin like a JPEG image
+ROUND, MCAP_START = ".mcap", b"\x89MCAP"
+ROUND_NAME, TAIL_BYTES = (
+    b"driverview.round",
+    1 << 16,
+)  # name of its metadata, at the file's start or in its index
+SQLITE_START = b"SQLite format 3\0"
+BAG_METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
+HEAD_BYTES = 400
+IMAGE_STARTS = (
+    b"\xff\xd8\xff", b"\x89PNG", b"BM", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ",
+    b"P4\n", b"P5\n", b"P6\n",
+)  # fmt: skip
+IMAGE_BRANDS = (b"avif", b"avis", b"heic", b"heix", b"mif1", b"msf1")
+FILM_STARTS = (
+    b"\x1aE\xdf\xa3", b"OggS", b"FLV\x01", b"GIF8", b"YUV4MPEG2", b"\0\0\x01\xba", b"\0\0\0\x01",
+    b"\0\0\x01", bytes.fromhex("3026b2758e66cf11"),
+)  # fmt: skip
+MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide")
+TS_SYNC, TS_PACKETS = 0x47, ((0, 188), (4, 192))  # MPEG-TS, and with the times of Blu-ray
+
+
+def kind_of(path: Path) -> Kind | None:
+    """Kind of the file at `path`; None for a kind that is not read."""
+    suffix = path.suffix.lower()
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        head = b""
+    if suffix == ROUND or head.startswith(MCAP_START):
+        is_round = not head.startswith(MCAP_START) or ROUND_NAME in head + _tail(path)
+        return Kind.ROUND if is_round else Kind.RECORDING
+    if head.startswith(SQLITE_START):
+        return Kind.RECORDING
+    found = _kind_of_content(head)
+    if found is Kind.IMAGE and suffix in MJPEG:
+        return Kind.FILM
+    if found is None and suffix in IMAGES:
+        return Kind.IMAGE
+    return Kind.FILM if found is None and suffix in FILMS else found
+
+
+def _tail(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - TAIL_BYTES, 0))
+        return file.read()
+
+
+def _kind_of_content(head: bytes) -> Kind | None:
+    if head[:4] == b"RIFF":
+        return {b"WEBP": Kind.IMAGE, b"AVI ": Kind.FILM}.get(head[8:12])
+    if head[4:8] in MP4_BOXES:
+        return Kind.IMAGE if head[8:12] in IMAGE_BRANDS else Kind.FILM
+    if head.startswith(IMAGE_STARTS):
+        return Kind.IMAGE
+    is_ts = any(head[first : first + 2 * step : step] == b"GG" for first, step in TS_PACKETS)
+    return Kind.FILM if is_ts or head.startswith(FILM_STARTS) else None
+
+
+def bag_metadata(folder: Path) -> dict[str, Any] | None:
+    """Content of the `metadata.yaml` of a ROS 2 bag; None if the folder is not a bag."""
+    with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
+        found = yaml.safe_load((folder / BAG_METADATA).read_text(encoding="utf-8"))
+        if isinstance(found, dict) and isinstance(found.get(BAG), dict):
+            return dict(found[BAG])
+    return None

@@ -1,0 +1,1 @@
+"""Pictures in recordings of other programs: MCAP files of Foxglove, and ROS 2 bags."""

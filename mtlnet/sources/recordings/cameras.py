@@ -1,0 +1,96 @@
+"""The camera of a recording's pictures, from ROS `CameraInfo` or Foxglove `CameraCalibration`.
+
+These messages state matrix and distortion; the mount on the car is taken from the model's camera.
+Sources: ROS `sensor_msgs/CameraInfo`, REP 104 of image_pipeline, Foxglove's schema.
+"""
+
+from dataclasses import replace
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from mtlnet.sources.recordings.images import CALIBRATION, ROS_CALIBRATION
+from mtlnet.sources.recordings.topic import Topic
+from trackfeatures.camera import CameraError, CameraParameters
+from trackfeatures.errors import UserError
+
+CALIBRATIONS = (ROS_CALIBRATION, CALIBRATION)
+PINHOLE = ("plumb_bob", "rational_polynomial")
+FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
+RECTIFIED = "image_rect"
+"""Part of the name of a topic whose pictures follow the projection matrix, without distortion (REP
+104)."""
+SAME_PX = 0.01
+MAX_NUMBER = 1e6  # limit of a matrix (px) or a distortion; damaged files exceed it
+
+
+def calibration_topic(image_topic: str, topics: list[Topic]) -> Topic | None:
+    """The calibration topic of an image topic: in its namespace or the nearest one around it.
+
+    None if there is none, or if several are equally near.
+    """
+    image = PurePosixPath(image_topic)
+    places = [image, *image.parents]
+    near: dict[int, list[Topic]] = {}
+    for topic in topics:
+        parent = PurePosixPath(topic.name).parent
+        if topic.schema in CALIBRATIONS and parent in places:
+            near.setdefault(places.index(parent), []).append(topic)
+    best = near[min(near)] if near else []
+    return best[0] if len(best) == 1 else None
+
+
+def camera_of(message: Any, image_topic: str, mount: CameraParameters) -> CameraParameters:
+    """The camera in a calibration message, mounted as `mount`.
+
+    Raises UserError if the message has no calibration, or a lens model that is not read.
+    """
+    is_ros = hasattr(message, "header")
+    names = "dkp" if is_ros else "DKP"
+    distortion, matrix, projection = (np.asarray(getattr(message, n), float) for n in names)
+    if RECTIFIED in image_topic and projection.size == 12:
+        matrix, distortion = projection.reshape(3, 4)[:, :3], np.zeros(0)
+    if matrix.size != 9 or not np.isfinite(matrix).all() or not matrix.ravel()[0] > 0:
+        raise UserError("it is not calibrated: its matrix K has no focal length")
+    if is_ros and (message.roi.width or message.roi.height or max(_binning(message)) > 1):
+        raise UserError("its pictures are a part (roi) or are binned, which is not read")
+    if not max(map(np.abs, (*matrix.ravel(), *distortion))) <= MAX_NUMBER:
+        raise UserError(f"one of its numbers is no number, or above {MAX_NUMBER:g}")
+    fx, _, cx, _, fy, cy, *_ = matrix.ravel().tolist()
+    try:
+        return replace(
+            mount,
+            width=int(message.width),
+            height=int(message.height),
+            matrix=(fx, fy, cx, cy),
+            **_lens(str(message.distortion_model), distortion),
+        )
+    except CameraError as error:
+        raise UserError(str(error)) from error
+
+
+def is_models(camera: CameraParameters, model: CameraParameters) -> bool:
+    """Whether a camera has the model's matrix and size and no distortion, so that its pictures fit
+    unchanged."""
+    same_size = (camera.width, camera.height) == (model.width, model.height)
+    matrices = camera.intrinsics(), model.intrinsics()
+    return camera.distortion == "none" and same_size and np.allclose(*matrices, atol=SAME_PX)
+
+
+def _lens(model: str, distortion: Any) -> dict[str, Any]:
+    if not distortion.any():
+        return {"distortion": "none", "coefficients": ()}
+    used = distortion[:8] if not distortion[8:].any() else distortion
+    coefficients = tuple(used.tolist())
+    if model in PINHOLE:
+        return {"distortion": "opencv", "coefficients": coefficients}
+    if model in FISHEYE:
+        return {"distortion": "fisheye", "coefficients": coefficients}
+    raise UserError(
+        f"its distortion model {model!r} is not read; known are {', '.join((*PINHOLE, *FISHEYE))}"
+    )
+
+
+def _binning(message: Any) -> tuple[int, int]:
+    return int(message.binning_x), int(message.binning_y)

@@ -1,0 +1,91 @@
+"""Foxglove's `CompressedVideo`: one picture per message, decoded from a file by OpenCV's FFmpeg.
+
+In an IVF file each message has its number as its time, so that an undecodable picture does not
+shift the others. IVF does not support H.265 in FFmpeg: such messages become a raw stream, whose
+pictures are counted. Source: the IVF header of libvpx.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+from mtlnet.sources.ffmpeg_log import decoding_errors
+from mtlnet.sources.films import no_frame, silent_opencv
+from mtlnet.sources.pictures import Picture, other_size
+from trackfeatures.errors import UserError
+
+CODES = {"h264": b"H264", "h265": b"", "vp9": b"VP90", "av1": b"AV01"}
+HEADER = struct.Struct("<4sHH4sHHIIII")
+FRAME = struct.Struct("<IQ")
+RATE = 1000
+
+
+class CodedFilm:
+    """Collects the messages of a topic, then decodes them. `fault` as in `Pictures`."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self.fault = ""
+        self._times: list[float] = []
+        self._in_ivf = True
+
+    def pictures(self, packets: Iterator[tuple[float, str, bytes]]) -> Iterator[Picture]:
+        """Yields the pictures of messages given as time in s, format and data.
+
+        Raises UserError for a format that is not read.
+        """
+        with TemporaryDirectory(prefix="driverview-") as folder:
+            file = Path(folder) / "film"
+            self._write(file, packets)
+            yield from self._decoded(file)
+
+    def _write(self, path: Path, packets: Iterator[tuple[float, str, bytes]]) -> None:
+        with path.open("wb") as file:
+            for number, (time_s, form, data) in enumerate(packets):
+                if form not in CODES:
+                    raise UserError(
+                        f"{self._name}: its format {form!r} is not read; known are "
+                        f"{', '.join(CODES)}"
+                    )
+                self._in_ivf = bool(CODES[form])
+                if self._in_ivf and not number:
+                    file.write(HEADER.pack(b"DKIF", 0, 32, CODES[form], 16, 16, RATE, 1, 0, 0))
+                if self._in_ivf:
+                    file.write(FRAME.pack(len(data), number))
+                file.write(data)
+                self._times.append(time_s)
+
+    def _decoded(self, path: Path) -> Iterator[Picture]:
+        used = 0
+        with decoding_errors() as errors:
+            with silent_opencv():
+                film = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+            try:
+                errors.forget()
+                while film.isOpened():
+                    found, frame = film.read()
+                    if not found:
+                        break
+                    number = round(film.get(cv2.CAP_PROP_PTS)) if self._in_ivf else used
+                    number = min(max(number, used), len(self._times) - 1)
+                    if size := errors.new_size(frame.shape):
+                        first = (frame.shape[1], frame.shape[0])
+                        self.fault = other_size(self._name, number, size, first)
+                        return
+                    image = frame.astype(np.uint8, copy=False)
+                    yield Picture(number, image, self._times[number], bgr=True)
+                    used += 1
+                if not used:
+                    raise UserError(f"{self._name}: {no_frame(film, errors)}")
+            finally:
+                film.release()
+        if used < len(self._times):
+            told = f" ({errors.first})" if errors.first else ""
+            self.fault = (
+                f"{self._name}: {len(self._times) - used} of {len(self._times)} pictures cannot be "
+                f"decoded{told}; the others were used"
+            )

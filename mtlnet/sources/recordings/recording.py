@@ -1,0 +1,141 @@
+"""A recording as a source of pictures: chooses the topic and decodes its messages in order."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mtlnet.inference.image_decoding.errors import ImageError
+from mtlnet.sources.pictures import Picture, other_size
+from mtlnet.sources.recordings.cameras import calibration_topic, camera_of
+from mtlnet.sources.recordings.coded_film import CodedFilm
+from mtlnet.sources.recordings.containers import Container, names_of, open_container
+from mtlnet.sources.recordings.images import (
+    IMAGES,
+    NANOSECONDS,
+    VIDEO,
+    picture_of,
+    reader_of,
+    time_of,
+)
+from mtlnet.sources.recordings.topic import Topic
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+KNOWN = ", ".join(IMAGES)
+
+
+@dataclass
+class Recording:
+    """The pictures of one topic. `fault` as in `Pictures`."""
+
+    path: Path
+    container: Container
+    topic: Topic
+    topics: list[Topic]
+    fault: str = ""
+
+    @property
+    def count(self) -> int:
+        """Number of pictures; 0: unknown."""
+        return self.topic.count or 0
+
+    def pictures(self) -> Iterator[Picture]:
+        """Yields each message's picture, numbered from 0, with the time of its header or else its
+        record.
+
+        A message that cannot be decoded becomes a picture with an error.
+        """
+        if self.topic.schema == VIDEO:
+            film = CodedFilm(f"{self.path} {self.topic.name}")
+            yield from film.pictures(self._packets())
+            self.fault = self.container.fault or film.fault
+            return
+        first: tuple[int, int] | None = None
+        for number, (time_ns, data) in enumerate(self.container.messages(self.topic.name)):
+            picture = self._picture(number, time_ns, data)
+            if picture.image is not None:
+                size = (picture.image.shape[1], picture.image.shape[0])
+                first = first or size
+                if size != first:
+                    self.fault = other_size(str(self.path), number, size, first)
+                    return
+            yield picture
+        self.fault = self.container.fault
+
+    def camera(self, mount: CameraParameters) -> tuple[CameraParameters | None, str]:
+        """The camera that the recording states, mounted as `mount`, and a line of text about it.
+
+        None with a line about the reason if it states one that cannot be used; None and an empty
+        line if it states none.
+        """
+        topic = calibration_topic(self.topic.name, self.topics)
+        if topic is None:
+            return None, ""
+        read = reader_of(topic.schema, topic.encoding)
+        try:
+            if read is None:
+                raise UserError(f"its encoding {topic.encoding!r} is not read")
+            _, data = next(self.container.messages(topic.name))
+            camera = camera_of(read(data), self.topic.name, mount)
+        except (UserError, StopIteration) as error:
+            return None, (
+                f"{self.path}: {topic.name} is not used: {error}; the model's own camera is "
+                "taken: give --camera"
+            )
+        return camera, (
+            f"{self.path}: matrix and distortion are those of {topic.name}, the mount is the "
+            f"model's ({camera.height_above_road_m:g} m above the road, pitch "
+            f"{camera.pitch_deg:g} degrees); --camera takes others"
+        )
+
+    def _reader(self) -> Callable[[bytes], Any]:
+        read = reader_of(self.topic.schema, self.topic.encoding)
+        assert read is not None, "topics of other kinds are not chosen"
+        return read
+
+    def _picture(self, number: int, time_ns: int, data: bytes) -> Picture:
+        try:
+            message = self._reader()(data)
+            image = picture_of(message, self.topic.schema)
+        except ImageError as error:
+            where = f"{self.path}#{number} ({self.topic.name})"
+            return Picture(number, None, time_ns / NANOSECONDS, error=f"{where}: {error}")
+        return Picture(number, image, time_of(message) or time_ns / NANOSECONDS)
+
+    def _packets(self) -> Iterator[tuple[float, str, bytes]]:
+        read = self._reader()
+        for time_ns, data in self.container.messages(self.topic.name):
+            message = read(data)
+            yield time_of(message) or time_ns / NANOSECONDS, message.format, message.data
+
+
+def open_recording(path: Path, topic: str = "") -> Recording:
+    """The pictures of `topic`, or of the only topic with pictures.
+
+    Raises UserError where there is no such topic, none or several; OSError.
+    """
+    container = open_container(path)
+    topics = container.topics()
+    images = [t for t in topics if reader_of(t.schema, t.encoding) and t.schema in IMAGES]
+    if topic:
+        found = next((t for t in topics if t.name == topic), None)
+        if found is None:
+            raise UserError(
+                f"{path} has no topic {topic}; its topics with pictures are {names_of(images)}"
+            )
+        if found not in images:
+            raise UserError(
+                f"{found} of {path} in {found.encoding} is not a supported picture ({KNOWN}); "
+                f"its topics with pictures are {names_of(images)}"
+            )
+        return Recording(path, container, found, topics)
+    if not images:
+        raise UserError(
+            f"{path} holds no pictures that are read ({KNOWN}); its topics are {names_of(topics)}"
+        )
+    if len(images) > 1:
+        raise UserError(
+            f"{path} has several topics with pictures: {names_of(images)}; choose one with --topic"
+        )
+    return Recording(path, container, images[0], topics)

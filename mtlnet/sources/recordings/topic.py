@@ -1,0 +1,18 @@
+"""A topic of a recording."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a recording; `count`: number of messages, None if unknown."""
+
+    name: str
+    schema: str
+    encoding: str
+    """Encoding of its messages: "cdr", "protobuf", "json", ..."""
+    count: int | None = None
+
+    def __str__(self) -> str:
+        messages = "" if self.count is None else f", {self.count} messages"
+        return f"{self.name} ({self.schema}{messages})"

@@ -1,0 +1,150 @@
+"""Live pictures: a webcam by its number or device, a stream by its address (RTSP, HTTP, ...).
+
+Source of addresses and their options: FFmpeg's protocols. Every wait has a time limit: a stream
+that stalls is reported and ends; the answers so far are kept.
+"""
+
+import re
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+
+from mtlnet.sources.ffmpeg_log import DecodingErrors, decoding_errors
+from mtlnet.sources.films import silent_opencv
+from mtlnet.sources.pictures import Picture, other_size
+from trackfeatures.errors import UserError
+
+SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp", "rtp")
+ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
+OPEN_S, STALL_S = 10.0, 10.0
+"""Time limits, s, for the first picture and for each later one: a camera on a slow link sends some
+pictures per second; the longest usual interval between key frames is about 10 s."""
+AT_ONCE_S = 0.05
+DEVICES = Path("/dev")
+
+
+def is_live(given: str) -> bool:
+    """Whether an input names a webcam or an address; an existing file of that name has
+    precedence."""
+    if Path(given).is_file() or Path(given).is_dir():
+        return False
+    return given.isdecimal() or given.startswith("/dev/video") or bool(ADDRESS.match(given))
+
+
+def shown_name(given: str) -> str:
+    """The input without the password, for tables, films and messages."""
+    if given.isdecimal():
+        return f"webcam {given}"
+    parts = urlsplit(given) if ADDRESS.match(given) else None
+    if parts is None or "@" not in parts.netloc:
+        return given
+    return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
+
+
+@dataclass
+class Stream:
+    """An opened webcam or stream. `fault` as in `Pictures`; `note`: how it ended without a
+    fault."""
+
+    name: str
+    film: cv2.VideoCapture
+    errors: DecodingErrors
+    opened: ExitStack
+    fault: str = ""
+    note: str = ""
+    fps: float = 0.0
+    damaged: int = 0
+    """Number of pictures in which FFmpeg reported an error."""
+    first_error: str = ""
+
+    def pictures(self) -> Iterator[Picture]:
+        """Yields the pictures as they arrive, each with its time of arrival."""
+        self.errors.forget()
+        with self.opened, silent_opencv():
+            number, waited_s = 0, 0.0
+            while True:
+                begin = time.monotonic()
+                found, frame = self.film.read()
+                took_s = time.monotonic() - begin
+                # After a stall the decoder returns at once the pictures that it has kept.
+                waited_s = took_s if took_s > AT_ONCE_S else max(waited_s, took_s)
+                if not found:
+                    self._end(number, waited_s)
+                    return
+                image = frame.astype(np.uint8, copy=False)
+                if size := self.errors.new_size(image.shape):
+                    first = (image.shape[1], image.shape[0])
+                    self.fault = other_size(self.name, number, size, first)
+                    return
+                self._note_damage(number)
+                yield Picture(number, image, time.time(), bgr=True)
+                number += 1
+
+    def _note_damage(self, number: int) -> None:
+        """Count an error of picture `number`; a stream joined between key frames starts with
+        errors."""
+        if self.errors.count and number:
+            self.damaged += 1
+            self.first_error = self.first_error or self.errors.first
+        self.errors.forget()
+
+    def _end(self, number: int, waited_s: float) -> None:
+        told = f" ({self.errors.first})" if self.errors.first else ""
+        if waited_s > 0.9 * STALL_S:
+            self.fault = (
+                f"{self.name} sent nothing for {waited_s:.0f} s after {number} pictures{told}; "
+                "those were used: check camera and network"
+            )
+        elif told or not number:
+            self.fault = (
+                f"{self.name} broke off after {number} pictures{told}; those were used: check "
+                "camera and network"
+            )
+        elif self.damaged:
+            self.fault = (
+                f"{self.name} ended after {number} pictures; {self.damaged} came damaged and may "
+                f"be wrong ({self.first_error})"
+            )
+        else:
+            self.note = f"{self.name} ended after {number} pictures"
+
+
+def open_stream(given: str) -> Stream:
+    """Open a webcam or stream. Raises UserError when that fails or takes longer than `OPEN_S`."""
+    name = shown_name(given)
+    scheme = ADDRESS.match(given)
+    if scheme and scheme[1].lower() not in SCHEMES:
+        raise UserError(
+            f"{name}: streams of kind {scheme[1]} are not read; give one of "
+            f"{', '.join(SCHEMES)}, or a file by its path"
+        )
+    opened = ExitStack()
+    errors = opened.enter_context(decoding_errors())
+    limits = [
+        cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(1e3 * OPEN_S),
+        cv2.CAP_PROP_READ_TIMEOUT_MSEC, int(1e3 * STALL_S),
+    ]  # fmt: skip
+    with silent_opencv():
+        if scheme:
+            film = cv2.VideoCapture(given, cv2.CAP_FFMPEG, limits)
+        else:
+            film = cv2.VideoCapture(int(given.removeprefix("/dev/video") or 0), cv2.CAP_V4L2)
+    opened.callback(film.release)
+    if film.isOpened():
+        fps = film.get(cv2.CAP_PROP_FPS)
+        return Stream(name, film, errors, opened, fps=fps if 0 < fps < 1000 else 0.0)
+    told = f" ({errors.first})" if errors.first else ""
+    opened.close()
+    if scheme:
+        raise UserError(
+            f"{name} cannot be opened as a stream within {OPEN_S:g} s{told}; check the address "
+            "with another player"
+        )
+    found = ", ".join(sorted(path.name for path in DEVICES.glob("video*"))) or "none"
+    raise UserError(f"{name} cannot be opened; the cameras of this machine are: {found}")

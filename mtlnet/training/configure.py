@@ -1,0 +1,129 @@
+"""The configuration of a new run from its options, or of a stored run from its `config.json`."""
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import trackfeatures as tf
+from mtlnet.architecture import find_architecture, with_heads
+from mtlnet.inference.model_card import (
+    RUNS,
+    WEIGHTS,
+    ModelCard,
+    ModelError,
+    check_files,
+    read_card,
+    resolve_run,
+)
+from mtlnet.training.config import CONFIG, TrainConfig
+from mtlnet.training.device import choose_device
+from mtlnet.training.distributed import read_rank
+from mtlnet.training.recipes import Recipe, find_recipe, learning_rate_factor
+from runtime.files import write_json
+from trackfeatures.errors import UserError
+
+DATASET = Path("datasets/default")
+RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
+"""Fields that may change when a run is resumed; a change of any other makes it a different run."""
+
+
+def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
+    """The configuration of a new run; defaults are those of the recipe, network or `init` model."""
+    if out is None and read_rank().world_size > 1:
+        raise UserError("give --out: several processes must use the same folder for the run")
+    values: dict[str, Any] = {"data": DATASET, "recipe": "fast"}
+    if "init" in options:
+        run, card = open_pretrained(options["init"])
+        values.update(network=card.network, alpha=card.alpha, recipe="tune")
+        options = {**options, "init": str(run)}
+    elif network := options.get("network"):
+        values["alpha"] = find_architecture(network).default_alpha
+    values.update(options)
+    recipe = find_recipe(values["recipe"]).name
+    values.update(_for_gpu(values))
+    if heads := values.pop("heads", None):
+        if "init" in options:
+            raise UserError("a fine-tuned model keeps its heads; leave --heads out with --init")
+        values["network"] = with_heads(values.get("network", find_recipe(recipe).network), heads)
+    folder = out or RUNS / f"{time.strftime('%Y%m%d-%H%M%S')}-{recipe}"
+    return TrainConfig(out=folder, **values)
+
+
+def _for_gpu(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Batch size and factor of the learning rate for a new run on a GPU; empty for a CPU."""
+    if choose_device(values.get("device", "auto"), read_rank()).type != "cuda":
+        return {}
+    recipe = find_recipe(values["recipe"])
+    batch = values.get("batch") or recipe.gpu_batch or recipe.batch
+    return {"batch": batch, "rate_factor": learning_rate_factor(recipe, max(batch, 1))}
+
+
+def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
+    """Folder and card of the model to start from. Raises ModelError when it is missing or
+    damaged."""
+    run = resolve_run(name)
+    card = read_card(run)
+    check_files(run, card, (WEIGHTS,))
+    return run, card
+
+
+def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
+    """Write the `config.json` of a run."""
+    values = {**asdict(config), "data": str(config.data), "out": str(config.out)}
+    content = {
+        "definitions": tf.VERSION,
+        "config": {
+            **values,
+            "change_data": False,
+        },  # only for this start: then `data` is the run's dataset
+        "recipe": asdict(recipe),
+        "data": dict(data),
+    }
+    write_json(config.out / CONFIG, content)
+
+
+def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """The configuration of a run and the description of its data. Raises ModelError."""
+    path = run / CONFIG
+    if not path.is_file():
+        raise ModelError(
+            f"{run} is not a training run ({CONFIG} is missing); give the --out of a run to resume"
+        )
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        tf.require_version(content["definitions"], f"the run in {run}")
+        values = content["config"]
+        values.update(data=Path(values["data"]), out=run, alpha=tuple(values["alpha"]))
+        return TrainConfig(**values), content["data"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelError(f"{path} is damaged ({error!r}); start a new run") from error
+
+
+def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
+    """The stored configuration of a run, changed by the fields `given` on the command line.
+
+    Raises UserError when a given field would make it a different run.
+    """
+    stored, data = read_config(run)
+    given = dict(given)
+    if heads := given.pop("heads", None):
+        given["network"] = with_heads(given.get("network", stored.network), heads)
+    for name, value in given.items():
+        kept = getattr(stored, name)
+        if name not in RESUMABLE_WITH and value != kept:
+            raise UserError(
+                f"{run} was started with {name} {kept}, now {value} is given; leave it out to "
+                "resume, or start a new run with another --out"
+            )
+    return replace(stored, **{k: v for k, v in given.items() if k in RESUMABLE_WITH}), data
+
+
+def newest_run() -> Path:
+    """The most recently started run in `runs/`. Raises ModelError when there is none."""
+    runs = [p.parent for p in RUNS.glob(f"*/{CONFIG}") if not p.parent.is_symlink()]
+    if not runs:
+        raise ModelError(f"there is no run in {RUNS}/ to resume; give its folder with --out")
+    return max(runs, key=lambda run: (run / CONFIG).stat().st_mtime)

@@ -1,0 +1,108 @@
+"""Weights of the three tasks in the loss: `--balance fixed|uncertainty|dwa`.
+
+`fixed`: the weights of `--alpha`, as in the paper. The other methods set the weights themselves;
+alpha then only selects the tasks (0: not learned).
+
+`uncertainty` (Kendall, Gal and Cipolla 2018, equation 7): the log variance s of each task is
+learned with the network; a squared error L contributes exp(-s) L / 2 + s / 2, a cross-entropy
+exp(-s) L + s / 2.
+
+`dwa`, dynamic weight average (Liu, Johns and Davison 2019, equation 7): a task whose loss falls
+more slowly gets more weight, K exp(r / T) / sum(exp(r / T)). Here r is the ratio of the mean term
+over the last window of steps to that over the window before, K the number of tasks and T = 2. A
+window is an epoch, or `WINDOW_STEPS` if that is shorter.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from mtlnet.training.losses.alpha import TASKS, Alpha, require_method
+from mtlnet.training.losses.multi_task import Terms
+
+LIKELIHOOD_FACTORS = (0.5, 0.5, 1.0)
+"""Factors of exp(-s) L: a normal distribution has half the squared error in its exponent, a
+cross-entropy no factor."""
+TEMPERATURE = 2.0
+WINDOW_STEPS = 500
+
+
+class TaskWeighting:
+    """The task weights at the current step, and the state they depend on."""
+
+    def __init__(
+        self, method: str, alpha: Alpha, device: torch.device, steps_per_epoch: int = WINDOW_STEPS
+    ) -> None:
+        self.method = require_method(method)
+        self.learned = torch.tensor([weight > 0 for weight in alpha], device=device)
+        self._tasks = [number for number, weight in enumerate(alpha) if weight > 0]
+        # Not a mask: a CUDA graph cannot record a selection of unknown size.
+        self._chosen = torch.tensor(self._tasks, device=device)
+        self._factors = torch.tensor(LIKELIHOOD_FACTORS, device=device)[self._chosen]
+        self.window = max(min(steps_per_epoch, WINDOW_STEPS), 1)
+        self.log_variance = nn.Parameter(torch.zeros(len(TASKS), device=device))
+        fixed = torch.tensor(alpha, device=device)
+        self.weights = fixed if method == "fixed" else self.learned.float()
+        self.sums = torch.zeros(len(TASKS), dtype=torch.float64, device=device)
+        self.previous_means = torch.zeros_like(self.sums)
+        self.counts = torch.zeros(2, dtype=torch.int64)
+        """Number of steps in this window, number of completed windows."""
+
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """Parameters to train together with the network's."""
+        return [self.log_variance] if self.method == "uncertainty" else []
+
+    def total(self, terms: Terms) -> Tensor:
+        """The minimised sum of the tasks' terms.
+
+        The terms of tasks with weight 0 are not part of its graph: a true single-task network.
+        """
+        chosen = torch.stack([terms[number] for number in self._tasks])
+        if self.method != "uncertainty":
+            return (self.weights.index_select(0, self._chosen) * chosen).sum()
+        s = self.log_variance.index_select(0, self._chosen)
+        return (self._factors * torch.exp(-s) * chosen + 0.5 * s).sum()
+
+    @torch.no_grad()
+    def current_weights(self) -> list[float]:
+        """Factor of each task's term at this step."""
+        if self.method != "uncertainty":
+            return [float(weight) for weight in self.weights]
+        factors = torch.tensor(LIKELIHOOD_FACTORS)
+        learned = factors * torch.exp(-self.log_variance.cpu()) * self.learned.cpu()
+        return [float(weight) for weight in learned]
+
+    @torch.no_grad()
+    def update(self, terms: Tensor) -> None:
+        """Add the terms (3,) of a step, averaged over the whole batch; used by `dwa`."""
+        if self.method != "dwa":
+            return
+        self.sums += terms
+        self.counts[0] += 1
+        if int(self.counts[0]) < self.window:
+            return
+        means = self.sums / self.window
+        if int(self.counts[1]) > 0:
+            previous = self.previous_means[self.learned].clamp_min(1e-12)
+            ratios = means[self.learned] / previous / TEMPERATURE
+            weights = torch.softmax(ratios, 0) * int(self.learned.sum())
+            self.weights[self.learned] = weights.float()
+        self.previous_means = means
+        self.sums.zero_()
+        self.counts = torch.tensor([0, int(self.counts[1]) + 1])
+
+    def state(self) -> dict[str, Tensor]:
+        """The tensors of a checkpoint, by the names in the file."""
+        return {
+            "log_variance": self.log_variance.detach(),
+            "current": self.weights,
+            "sums": self.sums,
+            "before": self.previous_means,
+            "counts": self.counts,
+        }
+
+    @torch.no_grad()
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restore a `state`. Raises KeyError when a tensor is missing."""
+        for name, tensor in self.state().items():
+            tensor.copy_(state[name])

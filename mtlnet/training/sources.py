@@ -1,0 +1,214 @@
+"""Training data of a run: the train rounds of a dataset, or a user's own labelled pictures."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.recording import Dataset, Frames
+from mtlnet.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom_images
+from mtlnet.data.description import describe_data, mean_labels
+from mtlnet.data.labels_file import LABELS
+from mtlnet.data.rounds import (
+    drop_undecodable,
+    hold_out_rounds,
+    open_training_dataset,
+    require_camera,
+    require_decodable,
+)
+from mtlnet.inference.model_card import ModelCard, ModelError
+from mtlnet.model.pretrained import match_convolutions
+from mtlnet.training.config import TrainConfig
+from mtlnet.training.recipes import find_recipe
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The frames of a run, all of one camera."""
+
+    frames: Frames | CustomImages
+    held_out: Frames | None
+    """Rounds for fitting the uncertainty head; None if there are too few."""
+    camera: CameraParameters
+    about: dict[str, Any]
+    """Description of the data: the `data` field of the model card."""
+
+    def spread_images(self, count: int) -> NDArray[np.uint8]:
+        """At most `count` images (B, 210, 280, 3), evenly spaced over the frames."""
+        count = min(count, len(self.frames))
+        rows = np.linspace(0, len(self.frames) - 1, count).astype(np.int64)
+        return self.frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
+
+
+def open_training_data(
+    config: TrainConfig, init: ModelCard | None, *, checked: bool = False
+) -> TrainingData:
+    """Open `config.data`: recorded rounds or a user's own pictures; `init`: the model to start
+    from.
+
+    All images are decoded once, so that a damaged one ends the run at its start; `checked`: this
+    was done before. Raises UserError for data that does not fit the network or the model.
+    """
+    normalised = find_recipe(config.recipe).batch_norm
+    if init is not None and normalised and find_architecture(init.network).backbone:
+        raise UserError(
+            f"--init is a {init.network}: the batch normalisation of torchvision's networks cannot "
+            "be restored; fine-tune it with --recipe tune"
+        )
+    if init is not None and init.network != config.network:
+        if not normalised:
+            raise UserError(
+                f"--init is a {init.network}, not a {config.network}; leave out --network, or give "
+                "--recipe continue"
+            )
+        match_convolutions(find_architecture(init.network), find_architecture(config.network))
+    if config.hold_out_drives and not has_labels_file(config.data):
+        raise UserError(
+            f"--hold-out-drives is for pictures with a {LABELS}; {config.data} holds recorded "
+            "rounds, whose split defines what is held out"
+        )
+    if has_labels_file(config.data):
+        data = custom_training_data(config.data, init, config.hold_out_drives)
+    else:
+        dataset = open_training_dataset(config.data)
+        if not (checked or config.skip_undecodable):
+            require_decodable(dataset.select("train"), config.data, skippable=True)
+        data = recorded_training_data(dataset, skip_undecodable=config.skip_undecodable)
+    if init is not None:
+        require_camera(init, data.camera)
+    return data
+
+
+def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "") -> TrainingData:
+    """A user's own pictures, rectified to the camera of the model `card`.
+
+    `drives`: names of drives to leave out, separated by commas. Raises UserError without a model.
+    """
+    if card is None:
+        raise UserError(
+            f"{folder} holds images of your own, without a description of their camera; give the "
+            "model to fine-tune with --init RUN, or --init default"
+        )
+    images, held_out = hold_out_drives(open_custom_images(folder, card.camera).for_training, drives)
+    about = {
+        "path": str(folder),
+        "content_hash": images.content_hash,
+        "frames": len(images),
+        "split": {"train": [str(folder)], "test": []},
+        "held_out": [],
+        "seeds": [],
+        "tracks": [],
+        "mean": mean_labels(images.labels),
+        "held_out_drives": held_out,
+        "pictures": sorted({*images.hashes}),
+    }
+    return TrainingData(images, None, card.camera, about)
+
+
+def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, list[str]]:
+    """The images without the drives named in `drives`, and the names of these drives.
+
+    The drives left out are not used at all: neither for the weights nor for the standard
+    deviations. Raises UserError for a drive without pictures, and when no drive is left.
+    """
+    names = [name.strip() for name in drives.split(",") if name.strip()]
+    known = sorted({picture.drive for picture in images.pictures})
+    for name in names:
+        if name not in known:
+            raise UserError(
+                f"--hold-out-drives has {name!r}; the drives in {images.path / LABELS} are "
+                f"{', '.join(repr(drive) for drive in known)}"
+            )
+    kept = [i for i, picture in enumerate(images.pictures) if picture.drive not in names]
+    if not kept:
+        raise UserError("--hold-out-drives names all drives; leave one to train on")
+    return images.take(kept), names
+
+
+def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
+    """The train rounds of a dataset; `skip_undecodable` leaves out frames that cannot be
+    decoded."""
+    frames, held_out = hold_out_rounds(dataset)
+    left_out: list[str] = []
+    if skip_undecodable:
+        frames, left_out = drop_undecodable(frames, dataset.path)
+    if skip_undecodable and held_out is not None:
+        held_out, more = drop_undecodable(held_out, dataset.path)
+        left_out += more
+    about = describe_data(dataset, frames, held_out)
+    return TrainingData(frames, held_out, dataset.camera, {**about, "undecodable": left_out})
+
+
+def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
+    """Data for training the model of `card` further; the model's own data is added to `about`."""
+    about = {
+        **_with_seen(data.about, card.data),
+        "init": _origin(card),
+        "earlier": [*card.data.get("earlier", ()), _summary(card.data)],
+    }
+    return replace(data, about=about)
+
+
+def resume_data(
+    config: TrainConfig,
+    data: TrainingData,
+    earlier: dict[str, Any],
+    start: ModelCard | None = None,
+) -> TrainingData:
+    """The data of a resumed run; if its earlier data was another dataset, that is added to `about`.
+
+    `earlier`: the description of the run's data so far. `start`: the model whose weights the run
+    needs again, because it has no checkpoint. Raises ModelError when that is another model than at
+    the first start, or when `data` is another dataset and `config.change_data` is not set.
+    """
+    if start is not None and earlier.get("init") != _origin(start):
+        raise ModelError(
+            f"{config.out} has no checkpoint, and the model {config.init} is not the one it was "
+            "started from; start a new run"
+        )
+    history = list(earlier.get("earlier", ()))
+    if config.change_data and data.about["content_hash"] != earlier.get("content_hash"):
+        history.append(_summary(earlier))
+    else:
+        require_same_data(config, earlier, data.about)
+    if not history:
+        return data
+    about = {**_with_seen(data.about, earlier), "earlier": history}
+    if "init" in earlier:  # the model that this name meant when the run was started
+        about["init"] = earlier["init"]
+    return replace(data, about=about)
+
+
+def _origin(card: ModelCard) -> dict[str, Any]:
+    """The entry for the model that a run starts from, in a description of data."""
+    return {"name": card.name, "model_hash": card.model_hash}
+
+
+def _summary(data: dict[str, Any]) -> dict[str, Any]:
+    """The entry for a dataset of an earlier training, in a model's card."""
+    return {name: data.get(name) for name in ("path", "content_hash", "frames")}
+
+
+def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """The description `about` with the rounds and tracks of `earlier` added as seen."""
+    names = [name for name in ("seeds", "tracks", "pictures") if name in about or name in earlier]
+    seen: dict[str, Any] = {
+        name: sorted({*about.get(name, ()), *earlier.get(name, ())}) for name in names
+    }
+    return {**about, **seen}
+
+
+def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
+    """Raise ModelError unless the data of a resumed run is the same as at its start."""
+    for name in ("content_hash", "split"):
+        if resumed.get(name) != data.get(name):
+            raise ModelError(
+                f"the {name.replace('_', ' ')} of {config.data} is not the one {config.out} was "
+                "started with; give that dataset with --data, add --change-data to continue on "
+                "this one, or start a new run"
+            )
