@@ -20,13 +20,16 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.extending import register_jitable
+
+import trackfeatures
 
 OWN_MODE = 0o700
 UNUSED_DAYS = 30.0  # after this time, unused machine code of other source versions is deleted
 
 
-def code_folder(name: str, package: Path) -> Path:
-    """A writable folder for the machine code of the sources in `package`.
+def code_folder(name: str, *packages: Path) -> Path:
+    """A writable folder for the machine code of the sources in `packages`.
 
     The folder is named after `name` and a hash of the sources. It is in `$NUMBA_CACHE_DIR`, or in
     the user's cache folder; if neither is writable, it is a temporary folder that is deleted when
@@ -36,8 +39,9 @@ def code_folder(name: str, package: Path) -> Path:
     to it. A temporary folder needs a random name: another user could create a predictable one.
     """
     digest = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        digest.update(source.read_bytes())
+    for package in packages:
+        for source in sorted(package.rglob("*.py")):
+            digest.update(source.read_bytes())
     found = f"{name}-{digest.hexdigest()[:16]}"
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     try:
@@ -87,7 +91,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def _cache_folder(package: str) -> str:
     """The folder for the machine code of a package, chosen when its first function is decorated."""
     # numba's Cache.__init__ reads the folder at decoration, so the first call would be too late.
-    return str(code_folder("driverview", Path(str(sys.modules[package].__file__)).parent))
+    sources = [Path(str(sys.modules[package].__file__)).parent]
+    # Compiled code contains functions and constants of this package.
+    sources.append(Path(trackfeatures.__file__).parent)
+    return str(code_folder("driverview", *sources))
 
 
 def compiled(function: Function) -> Function:
@@ -102,6 +109,11 @@ def compiled(function: Function) -> Function:
 def compiled_for_threads(function: Function) -> Function:
     """Like `compiled`, but the function releases the GIL: threads can run it in parallel."""
     return _compiled(function, nogil=True)
+
+
+def callable_from_compiled(function: Function) -> Function:
+    """Make a plain Python function callable from compiled code; outside it stays as it is."""
+    return cast(Function, register_jitable(function))
 
 
 def _compiled(function: Function, *, nogil: bool) -> Function:
