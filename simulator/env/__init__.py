@@ -26,24 +26,16 @@ from simulator import register_environments
 from simulator.env.action import action_space, to_command
 from simulator.env.cars import Cars
 from simulator.env.control_step import REWARD, SCORE
-from simulator.env.observation import Kind, Observation, Observer, reads_beams
-from simulator.env.options import DriveOptions, split_options
-from simulator.env.reward import ending
+from simulator.env.errors import NotCopyable, ResetNeeded
+from simulator.env.observation import Kind, Observation, Observer, read_from_beams
+from simulator.env.options import OPTIONS, DriveOptions, split_options
 from simulator.env.view_renderer import ViewRenderer
 from simulator.world.fleet import COMMAND_AT
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
-__all__ = ["DriveOptions", "DriverView", "LateralControl", "ending"]
+__all__ = ["OPTIONS", "DriveOptions", "DriverView", "LateralControl", "NotCopyable", "ResetNeeded"]
 RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
-
-
-class ResetNeeded(UserError, gym.error.ResetNeeded):
-    """`step` was called before `reset` or after the end of an episode."""
-
-
-class NotCopyable(UserError, TypeError):
-    """An environment cannot be copied or pickled."""
 
 
 class LateralControl(gym.Env[Any, Any]):
@@ -80,14 +72,13 @@ class LateralControl(gym.Env[Any, Any]):
             episode,
             noise=observation.state_noise,
             limit=observation.limit,
-            beams=reads_beams(observation.sensors),
+            beams=any(map(read_from_beams, observation.sensors)),
         )
         self._renderer, self._render_view = (
             ViewRenderer(self.world.road, picture),
             picture.render_view,
         )
-        beams = self._cars.beams[0] if self._cars.beams.size else None
-        self._observer = Observer(observation, self._renderer, beams)
+        self._observer = Observer(observation, self._renderer, self._cars.beams_of(0))
         self.render_mode = render_mode
         self.metadata = {**RENDERING, "render_fps": drive.frequency_hz}
         self._controls = drive.controls

@@ -1,15 +1,16 @@
 """The cars of an environment: one compiled call steps all of them, on one or more threads."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
+from simulator.env.action import naming_car
 from simulator.env.control_step import (
     DISTANCES_AT,
     ENDED,
@@ -30,7 +31,6 @@ from simulator.world.control_rate import PHYSICS_HZ
 from simulator.world.fleet import DONE, SKIPPED, TOUCHED, Fleet
 from simulator.world.world import World
 from trackfeatures.definitions import MARKINGS
-from trackfeatures.errors import UserError
 
 FEATURES = (*MARKINGS, "to_lane_centre")
 """The features of `results` from DISTANCES_AT on."""
@@ -80,6 +80,10 @@ class Cars:
 
     def world(self, number: int) -> World:
         return self.drives[number].world
+
+    def beams_of(self, number: int) -> FloatArray | None:
+        """The range beams (19,) of a car in m, None if they are not computed."""
+        return self.beams[number] if self.beams.size else None
 
     def reset(self, number: int, rng: np.random.Generator, start: Mapping[str, Any]) -> int:
         """Begin an episode of a car; returns its seed."""
@@ -174,14 +178,3 @@ class _Threads:
         if self._pool is not None and self._owner == os.getpid():
             self._pool.shutdown()
         self._pool = None
-
-
-@contextmanager
-def naming_car(number: int, count: int) -> Iterator[None]:
-    """Put the number of the car before the message of an error, if there are several cars."""
-    try:
-        yield
-    except UserError as error:
-        if count > 1:
-            error.args = (f"car {number}: {error}", *error.args[1:])
-        raise

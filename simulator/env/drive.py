@@ -58,8 +58,7 @@ class Drive:
 
     def reset(self, rng: np.random.Generator, given: Mapping[str, Any]) -> int:
         """Begin an episode that starts at the `given` options of `reset`; returns its seed."""
-        start = {**self._options.start, **given}
-        check_start(_least(start), self.world.road)
+        start = self.check(given)
         episode = int(rng.integers(2**31))
         if self._draws_road or self._draws_car:
             self.world.close()
@@ -67,6 +66,13 @@ class Drive:
         drawn = {name: draw(setting, rng) for name, setting in start.items()}
         self.world.reset(seed=episode, **check_start(drawn, self.world.road))
         return episode
+
+    def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The start of an episode with the `given` options of `reset`, before anything is drawn.
+        Raises UserError for an unknown option or a value that is no number."""
+        start = {**self._options.start, **given}
+        check_start({name: draw(value, None) for name, value in start.items()}, self.world.road)
+        return start
 
     def _make_world(self, rng: np.random.Generator | None) -> World:
         options = self._options
@@ -90,8 +96,3 @@ class Drive:
         if isinstance(options.lane_width, tuple):
             width = round(width, 1)
         return self._roads.road(options, track, lanes, width)
-
-
-def _least(start: Mapping[str, Any]) -> dict[str, Any]:
-    """The start with the least value of each range, to check names and numbers before drawing."""
-    return {name: draw(setting, None) for name, setting in start.items()}

@@ -101,8 +101,18 @@ class Observer:
         self._kind = options.observation
         self._renderer = renderer
         self.views = tuple(options.views or ())
-        sensors = [_with_beams(s, beams) for s in sensors_of(self._replace_camera(options.sensors))]
+        sensors = sensors_of(self._replace_camera(options.sensors))
+        from_beams = [sensor.name for sensor in sensors if read_from_beams(sensor)]
+        if beams is not None:
+            sensors = tuple(
+                replace(sensor, read=lambda world: beams) if sensor.name in from_beams else sensor
+                for sensor in sensors
+            )
         self.suite = SensorSuite(sensors, noise=options.sensor_noise)
+        self.batched = not self.views and all(
+            sensor.name in from_beams and not sensor.noise for sensor in self.suite.sensors
+        )
+        """Whether the observation consists of the state and of exact range beams only."""
         self._limit = options.limit
         self.space = self._space()
 
@@ -151,18 +161,9 @@ class Observer:
         return [camera if sensor == CAMERA else sensor for sensor in sensors]
 
 
-def reads_beams(sensors: Sequence[str | Sensor]) -> bool:
-    """Whether one of the sensors is the range meter, whose beams the control step computes."""
-    return any(
-        sensor.read is read_track_range
-        for sensor in sensors_of(sensor for sensor in sensors if sensor != CAMERA)
-    )
-
-
-def _with_beams(sensor: Sensor, beams: FloatArray | None) -> Sensor:
-    if beams is None or sensor.read is not read_track_range:
-        return sensor
-    return replace(sensor, read=lambda world: beams)
+def read_from_beams(sensor: str | Sensor) -> bool:
+    """Whether a sensor is the range meter, whose beams the control step computes."""
+    return sensor != CAMERA and sensors_of([sensor])[0].read is read_track_range
 
 
 def _sensor_space(sensor: Sensor) -> gym.spaces.Box:
