@@ -11,7 +11,7 @@ from runtime.jit import callable_from_compiled, compiled, compiled_for_threads
 from simulator.arrays import FloatArray
 from simulator.env.reward import ending_code, step_reward
 from simulator.sensors.beams import track_beams
-from simulator.track.piece_table import CURVATURE, foot_offset, index_at
+from simulator.track.piece_table import CURVATURE, foot_offset, index_near
 from simulator.vehicle.dynamics import PIECE
 from simulator.vehicle.track_state import (
     ANGLE,
@@ -103,8 +103,8 @@ def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, firs
     s, offset, angle = track[TRACK_S], track[TRACK_OFFSET], track[ANGLE]
     piece, z = int(car[MEMORY_AT + PIECE]), car[MOTION_AT + 2]
     measure_features(road, foot_offset(table, piece, s, offset, z), result[DISTANCES_AT:HEADING])
-    here = index_at(table, s)
-    ahead = index_at(table, s + LOOK_AHEAD_M)
+    here = index_near(table, s, piece)
+    ahead = index_near(table, s + LOOK_AHEAD_M, here)
     heading = classify_heading(table[here, CURVATURE], table[ahead, CURVATURE]).value
     result[HEADING] = heading
     state = states[number]

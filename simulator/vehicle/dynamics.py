@@ -14,7 +14,7 @@ from runtime.jit import compiled
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.car import GRAVITY
-from simulator.vehicle.orientation import rotation
+from simulator.vehicle.orientation import fill_axes
 from simulator.vehicle.powertrain import (
     clutch,
     free_engine_speed,
@@ -27,6 +27,7 @@ from simulator.vehicle.wheels import (
     WHEEL,
     add_tyre_forces,
     locate_contacts,
+    turn_wheels,
     tyre_slip_gains,
     update_loads,
 )
@@ -42,6 +43,19 @@ MOTION = 13
 UNDERBODY_CLEARANCE_M = 0.10
 """Height of the centre of gravity over the road (m) at which the underbody touches it."""
 UNDERBODY_SPRING, UNDERBODY_DAMPER = 500_000.0, 20_000.0
+
+
+Work = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Memory for one physics step, reused in the next: axes (3, 3), wheels (4, WHEEL), slip gains (4,),
+velocity (6,), turned wheels (9,), wrench (6,)."""
+
+
+@compiled
+def make_work() -> Work:
+    """Memory for the physics steps of one car."""
+    turned = np.zeros(9)
+    turned[0] = math.nan
+    return np.empty((3, 3)), np.empty((4, WHEEL)), np.empty(4), np.empty(6), turned, np.empty(6)
 
 
 @compiled
@@ -174,24 +188,47 @@ def compute_forces(
     200 Hz, and with the present velocity yaw would settle as if the car had 15 % less inertia.
     params: `CarParameters.packed()`; command: steer, throttle, brake in their ranges, and gear.
     """
-    p = params[0]
-    wheels, slip_gain, spin = np.empty((4, WHEEL)), np.empty(4), memory[SPIN : SPIN + 4]
-    axes = rotation(motion[3:7])
-    piece, s, d = locate(table, motion[0], motion[1], int(memory[PIECE]))
+    work = make_work()
+    fill_axes(motion[3:7], work[0])
+    at = locate(table, motion[0], motion[1], int(memory[PIECE]))
+    compute_forces_at(params[0], table, ground, at, motion, memory, command, work)
+    for i in range(6):
+        wrench[i] = work[5][i]
+
+
+@compiled
+def compute_forces_at(
+    p: Any,
+    table: Table,
+    ground: Ground,
+    at: tuple[int, float, float],
+    motion: FloatArray,
+    memory: FloatArray,
+    command: FloatArray,
+    work: Work,
+) -> None:
+    """`compute_forces` of a car whose place `at` (see `locate`) and axes in `work` are at hand; the
+    wrench is left in `work`."""
+    axes, wheels, slip_gain, velocity, turned, wrench = work
+    spin = memory[SPIN : SPIN + 4]
+    piece, s, d = at
     memory[PIECE] = piece
     z, nx, ny, nz = surface(table, piece, s, d)
     depth = UNDERBODY_CLEARANCE_M - (motion[2] - z) * nz
     before = memory[STEER]
     memory[STEER] = move_steering(p, before, command[0], DT)
-    locate_contacts(p, table, ground, piece, motion, axes, 0.5 * (before + memory[STEER]), wheels)
-    velocity = motion[7:13].copy()
+    turn_wheels(p, 0.5 * (before + memory[STEER]), turned)
+    locate_contacts(p, table, ground, piece, motion, axes, turned, wheels)
+    for i in range(6):
+        velocity[i] = motion[7 + i]
     for stage in range(2):
         update_loads(p, velocity, wheels)
         tyre_slip_gains(p, spin, wheels, slip_gain)
         if stage == 1:
             update_wheel_speeds(p, memory, command, wheels, slip_gain)
             tyre_slip_gains(p, spin, wheels, slip_gain)
-        wrench[:] = 0.0
+        for i in range(6):
+            wrench[i] = 0.0
         wrench[2] = -p.total_mass * GRAVITY
         add_tyre_forces(p, spin, wheels, slip_gain, wrench)
         add_aerodynamics(p, axes, velocity, wrench)

@@ -43,6 +43,18 @@ def wheel_angle(p: Any, wheel: int, steer: float) -> float:
 
 
 @compiled
+def turn_wheels(p: Any, steer: float, turned: FloatArray) -> None:
+    """Fill `turned` (9,): `steer`, and the cosine and sine of each wheel's angle. Steering mostly
+    rests, so that they are computed once for several steps."""
+    if turned[0] == steer:
+        return
+    turned[0] = steer
+    for wheel in range(4):
+        angle = wheel_angle(p, wheel, steer)
+        turned[1 + 2 * wheel], turned[2 + 2 * wheel] = math.cos(angle), math.sin(angle)
+
+
+@compiled
 def locate_contacts(
     p: Any,
     table: Table,
@@ -50,13 +62,13 @@ def locate_contacts(
     piece: int,
     motion: FloatArray,
     axes: FloatArray,
-    steer: float,
+    turned: FloatArray,
     wheels: FloatArray,
 ) -> None:
     """Fill the entries of `wheels` that do not depend on the body's velocity: contact point,
     directions, spring force, damper constant and surface.
 
-    axes (3, 3): body axes as rows; steer: front-wheel angle (rad).
+    axes (3, 3): body axes as rows; turned (9,): see `turn_wheels`.
     """
     ahead, left, up = axes[0], axes[1], axes[2]
     upright = True
@@ -77,7 +89,7 @@ def locate_contacts(
         for i in range(3):
             row[ARM + i] = ahead[i] * x + left[i] * y - up[i] * reach
         row[NORMAL], row[NORMAL + 1], row[NORMAL + 2] = nx, ny, nz
-        set_directions(p, row, axes, wheel_angle(p, wheel, steer))
+        set_directions(row, axes, turned[1 + 2 * wheel], turned[2 + 2 * wheel])
         row[SPRING] = min(p.cg_height - reach, MAX_TRAVEL_M)  # compression from rest
         row[DAMPER] = (p.damper_front if front else p.damper_rear) / upright_cosine
         upright = upright and upright_cosine > MIN_UPRIGHT_COSINE
@@ -87,13 +99,14 @@ def locate_contacts(
         wheels[2 * axle, SPRING] = spring_force(p, axle == 0, a, b)
         wheels[2 * axle + 1, SPRING] = spring_force(p, axle == 0, b, a)
     if not upright:
-        wheels[:, SPRING], wheels[:, DAMPER] = 0.0, 0.0
+        for wheel in range(4):
+            wheels[wheel, SPRING], wheels[wheel, DAMPER] = 0.0, 0.0
 
 
 @compiled
-def set_directions(p: Any, row: FloatArray, axes: FloatArray, angle: float) -> None:
-    """Fill in a wheel's directions in the road plane, `angle` rad to the left of the body's."""
-    cos_a, sin_a = math.cos(angle), math.sin(angle)
+def set_directions(row: FloatArray, axes: FloatArray, cos_a: float, sin_a: float) -> None:
+    """Fill in a wheel's directions in the road plane, turned to the left of the body's by the angle
+    of this cosine and sine."""
     nx, ny, nz = row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]
     fx = axes[0, 0] * cos_a + axes[1, 0] * sin_a
     fy = axes[0, 1] * cos_a + axes[1, 1] * sin_a
