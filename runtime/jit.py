@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.extending import register_jitable
+from numba.core import cgutils
+from numba.extending import intrinsic, register_jitable
 
 import trackfeatures
 
@@ -114,6 +115,23 @@ def compiled_for_threads(function: Function) -> Function:
 def callable_from_compiled(function: Function) -> Function:
     """Make a plain Python function callable from compiled code; outside it stays as it is."""
     return cast(Function, register_jitable(function))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def borrowed(typing_context: Any, array: Any) -> Any:
+    """In compiled code: the same array without its count of references. Views of an array count up
+    and down atomically, which takes longer than the arithmetic of small functions.
+
+    Use it on arguments only: the caller holds them until the function returns.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        made = context.make_array(signature.args[0])(context, builder, arguments[0])
+        made.meminfo = cgutils.get_null_value(made.meminfo.type)
+        made.parent = cgutils.get_null_value(made.parent.type)
+        return made._getvalue()
+
+    return array(array), generate
 
 
 def _compiled(function: Function, *, nogil: bool) -> Function:

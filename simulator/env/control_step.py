@@ -7,12 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import callable_from_compiled, compiled, compiled_for_threads
+from runtime.jit import borrowed, callable_from_compiled, compiled, compiled_for_threads
 from simulator.arrays import FloatArray
 from simulator.env.reward import ending_code, step_reward
 from simulator.sensors.beams import track_beams
 from simulator.track.piece_table import CURVATURE, foot_offset, index_near
-from simulator.vehicle.dynamics import PIECE
+from simulator.vehicle.dynamics import PIECE, make_work
 from simulator.vehicle.track_state import (
     ANGLE,
     TRACK_OFFSET,
@@ -22,7 +22,7 @@ from simulator.vehicle.track_state import (
     VY,
     YAW,
 )
-from simulator.world.control_step import advance_car
+from simulator.world.control_step import advance_car, lend, lend_work
 from simulator.world.fleet import (
     EDGE,
     HALF_WIDTH,
@@ -77,9 +77,10 @@ def step_cars(
 ) -> None:
     """Advance the cars from `begin` to before `end` by a control step of `steps` physics steps, and
     observe those that completed it."""
+    work, lent, filled = make_work(), lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
-        if advance_car(number, fleet, steps):
-            observe_car(number, fleet, outputs, rules, False)
+        if advance_car(number, lent, steps, lend_work(work)):
+            observe_car(number, lent, filled, rules, False)
 
 
 @compiled_for_threads
@@ -87,8 +88,16 @@ def observe_cars(
     begin: int, end: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool
 ) -> None:
     """Observe the cars from `begin` to before `end` after a step, or `first` in an episode."""
+    lent, filled = lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
-        observe_car(number, fleet, outputs, rules, first)
+        observe_car(number, lent, filled, rules, first)
+
+
+@compiled
+def lend_outputs(outputs: Outputs) -> Outputs:
+    """The same arrays without their counts of references."""
+    states, results, beams, noise = outputs
+    return borrowed(states), borrowed(results), borrowed(beams), borrowed(noise)
 
 
 @compiled

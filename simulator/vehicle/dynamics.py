@@ -53,9 +53,22 @@ velocity (6,), turned wheels (9,), wrench (6,)."""
 @compiled
 def make_work() -> Work:
     """Memory for the physics steps of one car."""
-    turned = np.zeros(9)
-    turned[0] = math.nan
-    return np.empty((3, 3)), np.empty((4, WHEEL)), np.empty(4), np.empty(6), turned, np.empty(6)
+    work = (
+        np.empty((3, 3)),
+        np.empty((4, WHEEL)),
+        np.empty(4),
+        np.empty(6),
+        np.empty(9),
+        np.empty(6),
+    )
+    forget_turn(work)
+    return work
+
+
+@compiled
+def forget_turn(work: Work) -> None:
+    """Let the next step compute the wheels' turn, because it may be another car's."""
+    work[4][0] = math.nan
 
 
 @compiled

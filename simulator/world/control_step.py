@@ -3,10 +3,10 @@
 A car that touches something stops at that physics step: `World.complete` goes on with it.
 """
 
-from runtime.jit import compiled, compiled_for_threads
+from runtime.jit import borrowed, compiled, compiled_for_threads
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import TRACK_LENGTH, Table
-from simulator.vehicle.dynamics import MEMORY, MOTION
+from simulator.vehicle.dynamics import MEMORY, MOTION, Work, make_work
 from simulator.vehicle.track_state import TRACK_S, TRACK_STATE_SIZE, measure_track_state
 from simulator.world.collisions import CONTACT_MARGIN_M
 from simulator.world.fleet import (
@@ -34,7 +34,38 @@ from simulator.world.free_motion import advance_free
 
 
 @compiled
-def advance_car(number: int, fleet: Arrays, steps: int) -> bool:
+def lend(fleet: Arrays) -> Arrays:
+    """The same arrays without their counts of references."""
+    cars, params, other, tables, left, right, roads, others, move = fleet
+    return (
+        borrowed(cars),
+        borrowed(params),
+        borrowed(other),
+        borrowed(tables),
+        borrowed(left),
+        borrowed(right),
+        borrowed(roads),
+        borrowed(others),
+        borrowed(move),
+    )
+
+
+@compiled
+def lend_work(work: Work) -> Work:
+    """The same arrays without their counts of references."""
+    axes, wheels, slip_gain, velocity, turned, wrench = work
+    return (
+        borrowed(axes),
+        borrowed(wheels),
+        borrowed(slip_gain),
+        borrowed(velocity),
+        borrowed(turned),
+        borrowed(wrench),
+    )
+
+
+@compiled
+def advance_car(number: int, fleet: Arrays, steps: int, work: Work) -> bool:
     """Advance car `number` by a control step of `steps` physics steps, unless it is left out or
     touches something. Returns whether the control step is complete; sets DONE."""
     cars, params, other, tables, left, right, roads, others, move = fleet
@@ -59,6 +90,7 @@ def advance_car(number: int, fleet: Arrays, steps: int) -> bool:
         0,
         steps,
         CONTACT_MARGIN_M if car[IN_CONTACT] != 0.0 else 0.0,
+        work,
     )
     car[DONE] = done
     if done > 0:
@@ -90,5 +122,6 @@ def measure_car(table: Table, car: FloatArray) -> None:
 @compiled_for_threads
 def advance_cars(begin: int, end: int, fleet: Arrays, steps: int) -> None:
     """Advance the cars from `begin` to before `end` by a control step."""
+    work, lent = make_work(), lend(fleet)
     for number in range(begin, end):
-        advance_car(number, fleet, steps)
+        advance_car(number, lent, steps, lend_work(work))

@@ -12,7 +12,7 @@ from runtime.jit import compiled
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate
 from simulator.traffic.wreck import lane_motion
-from simulator.vehicle.dynamics import DT, MOTION, PIECE, compute_forces_at, make_work
+from simulator.vehicle.dynamics import DT, MOTION, PIECE, Work, compute_forces_at, forget_turn
 from simulator.vehicle.orientation import fill_axes
 from simulator.vehicle.rigid_body import integrate_with
 from simulator.vehicle.surface import Ground
@@ -104,13 +104,15 @@ def advance_free(
     done: int,
     steps: int,
     margin: float,
+    work: Work,
 ) -> int:
     """Advance the ego car from physics step `done` of `steps` until it touches something.
 
     `margin` (m) as in `touches` applies before the first of these steps, and 0 afterwards. Returns
-    the number of steps then done.
+    the number of steps then done. `work` is memory for the steps.
     """
-    work, p = make_work(), params[0]
+    p, axes, wrench = params[0], work[0], work[5]
+    forget_turn(work)
     own_radius = box_radius(p)
     while done < steps:
         share, dt, radius = done / steps, steps * DT, own_radius + margin
@@ -119,9 +121,9 @@ def advance_free(
             params, other, table, walls, motion, at, others, move, share, dt, margin, radius
         ):
             return done
-        fill_axes(motion[3:7], work[0])
+        fill_axes(motion[3:7], axes)
         compute_forces_at(p, table, ground, at, motion, memory, command, work)
-        integrate_with(p, work[0], motion, work[5])
+        integrate_with(p, axes, motion, wrench)
         margin = 0.0
         done += 1
     return done

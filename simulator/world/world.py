@@ -18,7 +18,16 @@ from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
-from simulator.vehicle.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PIECE, SPIN, STEER
+from simulator.vehicle.dynamics import (
+    ENGINE,
+    MEMORY,
+    MOTION,
+    ODOMETER,
+    PIECE,
+    SPIN,
+    STEER,
+    make_work,
+)
 from simulator.vehicle.orientation import quaternion
 from simulator.vehicle.powertrain import gear_ratio
 from simulator.vehicle.state import CarState, Command
@@ -96,6 +105,7 @@ class World:
         self._motion = self._row[MOTION_AT : MOTION_AT + MOTION]
         self._memory = self._row[MEMORY_AT : MEMORY_AT + MEMORY]
         self._controls = self._row[COMMAND_AT : COMMAND_AT + 4]
+        self._work = make_work()
         self._contacts = ContactPhysics(road, self.car, walls)
         self._state: CarState | None = None
         self._state_step = 0.0
@@ -273,6 +283,7 @@ class World:
             done,
             steps,
             CONTACT_MARGIN_M,
+            self._work,
         )
 
     def _build_state(self) -> CarState:
