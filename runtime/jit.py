@@ -134,7 +134,19 @@ def borrowed(typing_context: Any, array: Any) -> Any:
     return array(array), generate
 
 
-def _compiled(function: Function, *, nogil: bool) -> Function:
+def inlined(function: Function) -> Function:
+    """Like `compiled`, for a small function of a hot loop: its machine code is put into its
+    callers', which saves the passing of arrays."""
+    return _compiled(function, nogil=False, forceinline=True)
+
+
+def _compiled(function: Function, *, nogil: bool, forceinline: bool = False) -> Function:
     vars(numba.config)["CACHE_DIR"] = _cache_folder(function.__module__.partition(".")[0])
-    decorate = numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=nogil)
+    decorate = numba.njit(
+        cache=True,
+        fastmath=False,
+        error_model="numpy",
+        nogil=nogil,
+        forceinline=forceinline,
+    )
     return cast(Function, decorate(function))

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 
 Table = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ HINT_REACH_M = 40.0
 """A foot point farther away than this is not trusted to be on the hinted part of the track."""
 
 
-@compiled
+@inlined
 def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
     """Foot point of (x, y) on piece `index`, extended beyond both ends: (local s, to_middle).
 
@@ -90,7 +90,7 @@ def index_near(table: Table, s: float, hint: int) -> int:
     return index_at(table, s)
 
 
-@compiled
+@inlined
 def wrap(table: Table, s: float) -> float:
     """`s` brought into [0, track length)."""
     total = table[0, TRACK_LENGTH]
@@ -122,7 +122,7 @@ def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, flo
     return best, wrap(table, table[best, S0] + best_s), best_d
 
 
-@compiled
+@inlined
 def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, float, float]:
     """Track coordinates of a world point: (piece index, s, to_middle).
 
@@ -153,7 +153,7 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
     return locate_everywhere(table, x, y)
 
 
-@compiled
+@inlined
 def surface(
     table: Table, index: int, s: float, to_middle: float
 ) -> tuple[float, float, float, float]:

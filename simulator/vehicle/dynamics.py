@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.car import GRAVITY
@@ -71,7 +71,7 @@ def forget_turn(work: Work) -> None:
     work[4][0] = math.nan
 
 
-@compiled
+@inlined
 def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
     """Front-wheel angle (rad) after `dt` s of turning towards `command` in [-1, 1]."""
     step = p.steering_rate * dt
@@ -79,7 +79,7 @@ def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
     return float(angle + min(max(wanted - angle, -step), step))
 
 
-@compiled
+@inlined
 def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
     """Wheel speed (rad/s) after a brake torque `brake` (N m) has acted on `spin` for `dt` s; it
     stops the wheel but never reverses it."""
@@ -138,11 +138,10 @@ def update_wheel_speeds(
         memory[ENGINE], _, _ = clutch(p, 0.5 * (spin[2] + spin[3]) * ratio, command[1])
 
 
-@compiled
+@inlined
 def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: FloatArray) -> None:
     """Add drag along the body and downforce at both axles (quadratic in the forward speed)."""
-    ahead, up = axes[0], axes[2]
-    speed = ahead[0] * velocity[0] + ahead[1] * velocity[1] + ahead[2] * velocity[2]
+    speed = axes[0, 0] * velocity[0] + axes[0, 1] * velocity[1] + axes[0, 2] * velocity[2]
     pressure = 0.5 * p.air_density * speed * speed
     drag = pressure * (p.drag_coefficient * p.frontal_area + p.wing_drag)
     if speed < 0.0:
@@ -151,11 +150,11 @@ def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: Flo
     # Pitch torque of the downforce at the axles, about the body's left axis.
     turn = p.front_axle * front - p.rear_axle * rear
     for i in range(3):
-        wrench[i] -= drag * ahead[i] + (front + rear) * up[i]
+        wrench[i] -= drag * axes[0, i] + (front + rear) * axes[2, i]
         wrench[3 + i] += turn * axes[1, i]
 
 
-@compiled
+@inlined
 def add_underbody_contact(
     depth: float, normal: tuple[float, float, float], velocity: FloatArray, wrench: FloatArray
 ) -> None:
@@ -170,7 +169,7 @@ def add_underbody_contact(
         wrench[2] += push * nz
 
 
-@compiled
+@inlined
 def accelerate(
     p: Any, axes: FloatArray, wrench: FloatArray, dt: float, velocity: FloatArray
 ) -> None:
@@ -209,7 +208,7 @@ def compute_forces(
         wrench[i] = work[5][i]
 
 
-@compiled
+@inlined
 def compute_forces_at(
     p: Any,
     table: Table,

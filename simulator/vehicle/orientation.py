@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 
 
 def quaternion(
@@ -39,7 +39,7 @@ def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return axes
 
 
-@compiled
+@inlined
 def fill_axes(quaternion: NDArray[np.float64], axes: NDArray[np.float64]) -> None:
     """Fill `axes` (3, 3), as `rotation`."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]

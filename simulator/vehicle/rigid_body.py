@@ -7,13 +7,13 @@ same whether PyBullet or this code moves the body. World frame, SI units.
 import math
 from typing import Any
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 from simulator.arrays import FloatArray
 from simulator.vehicle.dynamics import DT, accelerate
 from simulator.vehicle.orientation import rotation
 
 
-@compiled
+@inlined
 def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
     """Change of the angular velocity (body frame, rad/s) by one step of Euler's equations without
     torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
@@ -34,7 +34,7 @@ def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[flo
     return -gx / determinant, -gy / determinant, -gz / determinant
 
 
-@compiled
+@inlined
 def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -> None:
     """Rotate a unit quaternion (x, y, z, w) by the angular velocity (world frame) over `dt`."""
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
@@ -59,7 +59,7 @@ def integrate(p: Any, motion: FloatArray, wrench: FloatArray) -> None:
     integrate_with(p, rotation(motion[3:7]), motion, wrench)
 
 
-@compiled
+@inlined
 def integrate_with(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
     """`integrate`, with the body's `axes` (3, 3) at hand."""
     tx, ty, tz = gyroscopic_change(p, axes, motion)

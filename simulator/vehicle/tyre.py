@@ -6,14 +6,14 @@ The magic formula and the effect of the load are those of the TORCS car model.
 import math
 from typing import Any
 
-from runtime.jit import compiled
+from runtime.jit import inlined
 
 MIN_SLIP_SPEED_M_S = 4.0
 """Least reference speed (m/s) of the slip: a standing tyre then acts as a damper, and the 200 Hz
 integration stays stable (the rate of a stiff tyre grows as one over the speed)."""
 
 
-@compiled
+@inlined
 def slip_force_ratio(
     slip: float, peak: float, stiffness: float, slope: float, shape: float, curvature: float
 ) -> float:
@@ -30,7 +30,7 @@ def slip_force_ratio(
     return peak * math.sin(shape * math.atan(argument)) / slip
 
 
-@compiled
+@inlined
 def peak_force(p: Any, front: bool, load: float, grip: float) -> float:
     """Largest force (N) of a tyre at `load` (N) on ground of this `grip`; the friction coefficient
     falls with the load."""
@@ -42,7 +42,7 @@ def peak_force(p: Any, front: bool, load: float, grip: float) -> float:
     return float(friction * gain * grip * load)
 
 
-@compiled
+@inlined
 def tyre_slip_gain(p: Any, peak: float, along: float, across: float, spin: float) -> float:
     """Tyre force per m/s of slip speed (N s/m), at the present combined slip.
 
