@@ -4,10 +4,10 @@ Run: `python benchmarks/vector_env.py [--json FILE]`, about three minutes on two
 50,000 steps a second on one core and 90,000 on two without beams, 60,000 on two with 19 range beams
 in each step, at most 12 microseconds of the compiled control step a car.
 
-On one core all environments take turns in one process pinned to it; a figure is the median over the
-turns of car steps per second of processor time, policy and resets included. Two threads are timed by
-the clock. CarRacing-v3 and racetrack-v0 run in vectors of two by Gymnasium's `SyncVectorEnv`, whose
-vectors in processes are slower on so few cores (`state_env.py`).
+On one core all environments take turns in one process pinned to it; a figure is the median over
+the turns of car steps per second of processor time, policy and resets included. Two threads are
+timed by the clock. CarRacing-v3 and racetrack-v0 run in vectors of two by Gymnasium's
+`SyncVectorEnv`, whose vectors in processes are slower on so few cores (`state_env.py`).
 """
 
 import argparse

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numba
 from numba.core import cgutils
@@ -86,6 +86,7 @@ def _forget_unused(parent: Path, name: str) -> None:
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Item = TypeVar("Item")
 
 
 @functools.cache
@@ -114,24 +115,29 @@ def compiled_for_threads(function: Function) -> Function:
 
 def callable_from_compiled(function: Function) -> Function:
     """Make a plain Python function callable from compiled code; outside it stays as it is."""
-    return cast(Function, register_jitable(function))
+    return register_jitable(function)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def borrowed(typing_context: Any, array: Any) -> Any:
-    """In compiled code: the same array without its count of references. Views of an array count up
-    and down atomically, which takes longer than the arithmetic of small functions.
+class Borrow(Protocol):
+    """The type of `borrowed`."""
 
-    Use it on arguments only: the caller holds them until the function returns.
-    """
+    def __call__(self, array: Item) -> Item: ...
 
+
+def _borrow(typing_context: Any, array: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        null: Any = cgutils.get_null_value
         made = context.make_array(signature.args[0])(context, builder, arguments[0])
-        made.meminfo = cgutils.get_null_value(made.meminfo.type)
-        made.parent = cgutils.get_null_value(made.parent.type)
+        made.meminfo, made.parent = null(made.meminfo.type), null(made.parent.type)
         return made._getvalue()
 
     return array(array), generate
+
+
+borrowed: Borrow = cast(Any, intrinsic(_borrow))
+"""In compiled code: the same array without its count of references. Views of an array count up and
+down atomically, which takes longer than the arithmetic of small functions. Use it on arguments
+only: the caller holds them until the function returns."""
 
 
 def inlined(function: Function) -> Function:

@@ -6,6 +6,10 @@
     gymnasium.make("driverview/LateralControl-v0", track="circuit", lanes=1, frequency_hz=20)
     gymnasium.make("driverview/DriverView-v0", track="forza", views=("front", "rear"))
 
+many cars in one compiled call (`simulator.env.vector`)
+
+    gymnasium.make_vec("driverview/LateralControl-v0", 256, "vector_entry_point", track="random")
+
 or, without the second import, by Gymnasium's own syntax for names that a module registers:
 
     gymnasium.make("simulator.env:driverview/LateralControl-v0")

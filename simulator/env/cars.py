@@ -106,7 +106,7 @@ class Cars:
             if moving[number]:
                 self.world(number).begin()
         if self._noise:
-            for number in np.flatnonzero(moving):
+            for number in np.flatnonzero(moving).tolist():
                 self._draw_noise(number, rngs[number])
         self._threads.run(
             step_cars, len(rows), self.fleet.arrays, self._steps, self._outputs, self._rules

@@ -3,6 +3,7 @@ and ending, over the rows of a fleet. SI units, track frame.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,7 +148,7 @@ def measure_features(road: FloatArray, offset: float, out: FloatArray) -> None:
     """Fill `out` (6,): the five distances (m) and the offset from the lane's centre, NaN for an
     absent one, of a car `offset` m left of the middle of `road` (ROAD_SIZE,)."""
     lanes, width = int(road[LANES]), road[LANE_WIDTH]
-    lines = road[LINES_AT : LINES_AT + 2 * MARKINGS].reshape(MARKINGS, 2)
+    lines: Any = road[LINES_AT : LINES_AT + 2 * MARKINGS].reshape(MARKINGS, 2)
     ml, mr = in_lane_distances(offset, lanes, width, lines)
     l, m, r = on_marking_distances(offset, lanes, width, lines)
     centre = lane_offset(ml, mr, l, m, r)

@@ -216,7 +216,8 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             state = self._cars.states[number].copy()
             self._observed[number] = self._observers[number].observe(self.world(number), state)
         space = self.single_observation_space
-        return concatenate(space, self._observed, create_empty_array(space, self.num_envs))
+        empty: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, self._observed, empty)
 
     def _info(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
         return vector_info(self._cars, self._frequency_hz, chosen)

@@ -40,20 +40,28 @@ def vector_info(cars: Cars, frequency_hz: int, chosen: NDArray[np.bool_]) -> dic
         "ended": _ENDINGS[results[:, ENDED].astype(int)],
     }
     info: dict[str, Any] = {}
+    everyone = bool(chosen.all())
     for name, column in columns.items():
-        _add(info, name, column, chosen)
+        _add(info, name, column, chosen, everyone)
     features: dict[str, Any] = {}
+    found = ~np.isnan(results[:, DISTANCES_AT:HEADING]) & chosen[:, np.newaxis]
+    anyone, all_of_them = found.any(axis=0).tolist(), found.all(axis=0).tolist()
     for k, name in enumerate(FEATURES):
-        column = results[:, DISTANCES_AT + k]
-        _add(features, name, column, chosen & ~np.isnan(column))
-    _add(features, "angle", track[:, ANGLE], chosen)
-    _add(features, "heading", results[:, HEADING].astype(int), chosen)
+        if anyone[k]:
+            _add(features, name, results[:, DISTANCES_AT + k], found[:, k], all_of_them[k])
+    _add(features, "angle", track[:, ANGLE], chosen, everyone)
+    _add(features, "heading", results[:, HEADING].astype(int), chosen, everyone)
     return info | {"features": features, "_features": chosen.copy()}
 
 
-def _add(info: dict[str, Any], name: str, column: NDArray[Any], present: NDArray[np.bool_]) -> None:
+def _add(
+    info: dict[str, Any],
+    name: str,
+    column: NDArray[Any],
+    present: NDArray[np.bool_],
+    everyone: bool,
+) -> None:
     """Add a column; 0, or None instead of a string, for cars that do not have it."""
-    if present.any():
-        absent: Any = None if column.dtype == object else 0
-        info[name] = column.copy() if present.all() else np.where(present, column, absent)
-        info[f"_{name}"] = present.copy()
+    absent: Any = None if column.dtype == object else 0
+    info[name] = column.copy() if everyone else np.where(present, column, absent)
+    info[f"_{name}"] = present.copy()

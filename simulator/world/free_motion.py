@@ -117,7 +117,8 @@ def advance_free(
     while done < steps:
         share, dt, radius = done / steps, steps * DT, own_radius + margin
         at = locate(table, motion[0], motion[1], int(memory[PIECE]))
-        if touches_at(
+        beside_wall = abs(at[2]) > walls[0] - radius
+        if (beside_wall or others.shape[0]) and touches_at(
             params, other, table, walls, motion, at, others, move, share, dt, margin, radius
         ):
             return done
