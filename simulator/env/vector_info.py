@@ -45,10 +45,11 @@ def vector_info(cars: Cars, frequency_hz: int, chosen: NDArray[np.bool_]) -> dic
         _add(info, name, column, chosen, everyone)
     features: dict[str, Any] = {}
     found = ~np.isnan(results[:, DISTANCES_AT:HEADING]) & chosen[:, np.newaxis]
-    anyone, all_of_them = found.any(axis=0).tolist(), found.all(axis=0).tolist()
+    counts = np.count_nonzero(found, axis=0).tolist()
     for k, name in enumerate(FEATURES):
-        if anyone[k]:
-            _add(features, name, results[:, DISTANCES_AT + k], found[:, k], all_of_them[k])
+        if counts[k]:
+            column = results[:, DISTANCES_AT + k]
+            _add(features, name, column, found[:, k], counts[k] == len(found))
     _add(features, "angle", track[:, ANGLE], chosen, everyone)
     _add(features, "heading", results[:, HEADING].astype(int), chosen, everyone)
     return info | {"features": features, "_features": chosen.copy()}

@@ -1,5 +1,6 @@
 """Many cars in one vector environment: the same numbers as single environments, bit for bit."""
 
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -78,7 +79,8 @@ def test_64_cars_on_five_tracks_equal_single_environments(steps: int, longest: i
     for number in range(CARS):
         env = make_single(number, LIST, max_episode_steps=longest)
         observation, info = env.reset(seed=seeds[number])
-        seen, heard, over = [observation], [], False
+        heard: list[Any] = []
+        seen, over = [observation], False
         for step in range(steps):
             if over:
                 observation, info = env.reset()
@@ -110,7 +112,7 @@ def test_everything_equals_gymnasiums_vector_of_single_environments(
     count, options = 5, {"max_episode_steps": 40, **shared}
     lists = {name: values[:count] for name, values in LIST.items()}
     expected = gym.vector.SyncVectorEnv(
-        [lambda k=k: make_single(k, lists, **options) for k in range(count)], autoreset_mode=mode
+        [partial(make_single, k, lists, **options) for k in range(count)], autoreset_mode=mode
     )
     vector = make_vector(count, autoreset_mode=mode, threads=2, **lists, **options)
     assert vector.observation_space == expected.observation_space
@@ -301,7 +303,7 @@ def test_gymnasiums_vector_wrappers_run_on_it() -> None:
     )
     vector = gym.wrappers.vector.NormalizeReward(gym.wrappers.vector.ClipAction(vector))
     observations, _ = vector.reset(seed=0)
-    lengths = []
+    lengths: list[int] = []
     for _ in range(50):
         assert vector.observation_space.contains(observations)
         observations, *_, info = vector.step(vector.action_space.sample())
@@ -311,6 +313,7 @@ def test_gymnasiums_vector_wrappers_run_on_it() -> None:
     vector.close()
 
 
+@pytest.mark.slow
 def test_views_and_frames_are_those_of_the_single_environment() -> None:
     shown: dict[str, Any] = {"render_mode": "rgb_array", "width": 64, "height": 48}
     vector = make_vector(1, track="oval", views=("front",), **shown)
