@@ -80,14 +80,15 @@ def test_64_cars_on_five_tracks_equal_single_environments(steps: int, longest: i
         env = make_single(number, LIST, max_episode_steps=longest)
         observation, info = env.reset(seed=seeds[number])
         heard: list[Any] = []
-        seen, over = [observation], False
+        seen: list[Any] = [observation]
+        over: Any = False
         for step in range(steps):
             if over:
                 observation, info = env.reset()
                 heard.append((0.0, False, False, info["score"], info["s"]))
             else:
-                observation, *rest, info = env.step(actions[step, number])
-                heard.append((*rest, info["score"], info["s"]))
+                observation, reward, ended, cut, info = env.step(actions[step, number])
+                heard.append((reward, ended, cut, info["score"], info["s"]))
             over = heard[-1][1] or heard[-1][2]
             seen.append(observation)
         env.close()
