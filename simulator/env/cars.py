@@ -18,7 +18,6 @@ from simulator.env.control_step import (
     RESULT,
     REWARD,
     SCORE,
-    STATE_SIZE,
     TO_LANE_CENTRE,
     observe_cars,
     step_cars,
@@ -31,6 +30,7 @@ from simulator.world.control_rate import PHYSICS_HZ
 from simulator.world.fleet import DONE, SKIPPED, TOUCHED, Fleet
 from simulator.world.world import World
 from trackfeatures.definitions import MARKINGS
+from trackfeatures.state_vector import STATE_SIZE
 
 FEATURES = (*MARKINGS, "to_lane_centre")
 """The features of `results` from DISTANCES_AT on."""

@@ -50,15 +50,14 @@ from trackfeatures.measurement import (
     lane_index,
     on_marking_distances,
 )
+from trackfeatures.state_vector import STATE_SIZE, state_vector
 
 for function in (
     *(classify_heading, lane_centre, lane_index, lane_offset),
-    *(in_lane_distances, on_marking_distances),
+    *(in_lane_distances, on_marking_distances, state_vector),
 ):
     callable_from_compiled(function)
 
-SPEED_SCALE = 75.0 / 3.6  # m/s
-STATE_SIZE = 7
 # A row of `results` (RESULT,): reward; one more than the index of the ending, 0 for none; sum of
 # the rewards; the five distances and the offset from the lane's centre, NaN for an absent one; the
 # class of the road.
@@ -115,15 +114,12 @@ def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, firs
     measure_features(road, foot_offset(table, piece, s, offset, z), result[DISTANCES_AT:HEADING])
     here = index_near(table, s, piece)
     ahead = index_near(table, s + LOOK_AHEAD_M, here)
-    heading = classify_heading(table[here, CURVATURE], table[ahead, CURVATURE]).value
-    result[HEADING] = heading
-    state = states[number]
-    write(state, 0, offset / road[HALF_WIDTH], noise[number], limit)
-    write(state, 1, angle / math.pi, noise[number], limit)
-    write(state, 2, track[VX] / SPEED_SCALE, noise[number], limit)
-    write(state, 3, track[VY] / SPEED_SCALE, noise[number], limit)
-    for k in range(3):
-        write(state, 4 + k, 1.0 if k == heading else 0.0, noise[number], limit)
+    heading = classify_heading(table[here, CURVATURE], table[ahead, CURVATURE])
+    result[HEADING] = heading.value
+    vector = state_vector(offset, angle, track[VX], track[VY], heading, road[HALF_WIDTH])
+    for k in range(STATE_SIZE):
+        value = vector[k] + noise[number, k] if noise.shape[1] else vector[k]
+        states[number, k] = min(max(value, -limit), limit)
     if beams.shape[1]:
         x, y = car[MOTION_AT], car[MOTION_AT + 1]
         track_beams(table, here, x, y, track[YAW], angles, road[EDGE], beams[number])
@@ -158,13 +154,3 @@ def measure_features(road: FloatArray, offset: float, out: FloatArray) -> None:
     out[3] = math.nan if m is None else m
     out[4] = math.nan if r is None else r
     out[5] = math.nan if centre is None else centre
-
-
-@compiled
-def write(
-    state: NDArray[np.float32], index: int, value: float, noise: FloatArray, limit: float
-) -> None:
-    """Write one number of a state, with its noise if there is any, within the bound."""
-    if noise.shape[0]:
-        value += noise[index]
-    state[index] = min(max(value, -limit), limit)
