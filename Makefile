@@ -79,7 +79,15 @@ extended: $(READY) ## the long tests that `make test` leaves out
 compiled: $(READY)
 	@folder=$$(mktemp -d); \
 	$(BIN)/datagen collect --rounds 1 --frames 3 --tracks oval --workers 1 --out $$folder/data \
-	  >/dev/null 2>$$folder/said || { cat $$folder/said >&2; exit 1; }; rm -rf $$folder
+	  >/dev/null 2>$$folder/said && $(BIN)/python -c '$(STEP_A_VECTOR)' 2>$$folder/said \
+	  || { cat $$folder/said >&2; exit 1; }; rm -rf $$folder
+
+define STEP_A_VECTOR
+import gymnasium, numpy; \
+name = "simulator.env:driverview/LateralControl-v0"; \
+cars = gymnasium.make_vec(name, 2, vectorization_mode="vector_entry_point", sensors=("range",), traffic=1); \
+cars.reset(seed=0); cars.step(numpy.zeros((2, 1)))
+endef
 
 check: $(READY) ## format, lint, types, imports, links
 	$(BIN)/ruff format --check .

@@ -17,16 +17,20 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numba
+from numba.core import cgutils
+from numba.extending import intrinsic, register_jitable
+
+import trackfeatures
 
 OWN_MODE = 0o700
 UNUSED_DAYS = 30.0  # after this time, unused machine code of other source versions is deleted
 
 
-def code_folder(name: str, package: Path) -> Path:
-    """A writable folder for the machine code of the sources in `package`.
+def code_folder(name: str, *packages: Path) -> Path:
+    """A writable folder for the machine code of the sources in `packages`.
 
     The folder is named after `name` and a hash of the sources. It is in `$NUMBA_CACHE_DIR`, or in
     the user's cache folder; if neither is writable, it is a temporary folder that is deleted when
@@ -36,8 +40,9 @@ def code_folder(name: str, package: Path) -> Path:
     to it. A temporary folder needs a random name: another user could create a predictable one.
     """
     digest = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        digest.update(source.read_bytes())
+    for package in packages:
+        for source in sorted(package.rglob("*.py")):
+            digest.update(source.read_bytes())
     found = f"{name}-{digest.hexdigest()[:16]}"
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     try:
@@ -81,13 +86,17 @@ def _forget_unused(parent: Path, name: str) -> None:
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Item = TypeVar("Item")
 
 
 @functools.cache
 def _cache_folder(package: str) -> str:
     """The folder for the machine code of a package, chosen when its first function is decorated."""
     # numba's Cache.__init__ reads the folder at decoration, so the first call would be too late.
-    return str(code_folder("driverview", Path(str(sys.modules[package].__file__)).parent))
+    sources = [Path(str(sys.modules[package].__file__)).parent]
+    # Compiled code contains functions and constants of this package.
+    sources.append(Path(trackfeatures.__file__).parent)
+    return str(code_folder("driverview", *sources))
 
 
 def compiled(function: Function) -> Function:
@@ -104,7 +113,46 @@ def compiled_for_threads(function: Function) -> Function:
     return _compiled(function, nogil=True)
 
 
-def _compiled(function: Function, *, nogil: bool) -> Function:
+def callable_from_compiled(function: Function) -> Function:
+    """Make a plain Python function callable from compiled code; outside it stays as it is."""
+    return register_jitable(function)
+
+
+class Borrow(Protocol):
+    """The type of `borrowed`."""
+
+    def __call__(self, array: Item) -> Item: ...
+
+
+def _borrow(typing_context: Any, array: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        null: Any = cgutils.get_null_value
+        made = context.make_array(signature.args[0])(context, builder, arguments[0])
+        made.meminfo, made.parent = null(made.meminfo.type), null(made.parent.type)
+        return made._getvalue()
+
+    return array(array), generate
+
+
+borrowed: Borrow = cast(Any, intrinsic(_borrow))
+"""In compiled code: the same array without its count of references. Views of an array count up and
+down atomically, which takes longer than the arithmetic of small functions. Use it on arguments
+only: the caller holds them until the function returns."""
+
+
+def inlined(function: Function) -> Function:
+    """Like `compiled`, for a small function of a hot loop: its machine code is put into its
+    callers', which saves the passing of arrays."""
+    return _compiled(function, nogil=False, forceinline=True)
+
+
+def _compiled(function: Function, *, nogil: bool, forceinline: bool = False) -> Function:
     vars(numba.config)["CACHE_DIR"] = _cache_folder(function.__module__.partition(".")[0])
-    decorate = numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=nogil)
+    decorate = numba.njit(
+        cache=True,
+        fastmath=False,
+        error_model="numpy",
+        nogil=nogil,
+        forceinline=forceinline,
+    )
     return cast(Function, decorate(function))

@@ -10,6 +10,8 @@ ENVIRONMENTS = {
     "driverview/LateralControl-v0": "simulator.env:LateralControl",
     "driverview/DriverView-v0": "simulator.env:DriverView",
 }
+VECTORS = {"driverview/LateralControl-v0": "simulator.env.vector:LateralControlVector"}
+"""Classes that step many cars in one call, for `gymnasium.make_vec`."""
 MAX_STEPS = 6500
 """The paper's longest episode, in control steps."""
 
@@ -20,7 +22,12 @@ def register_environments() -> None:
 
     for name, entry_point in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(id=name, entry_point=entry_point, max_episode_steps=MAX_STEPS)
+            gymnasium.register(
+                id=name,
+                entry_point=entry_point,
+                vector_entry_point=VECTORS.get(name),
+                max_episode_steps=MAX_STEPS,
+            )
 
 
 if "gymnasium" in sys.modules:  # commands without environments do not import gymnasium

@@ -97,8 +97,8 @@ def measure(
     bounded by its nearer line. Without it every line is at its marking's nominal position.
     """
     offsets = line_offsets or _ONE_LINE
-    ml, mr = _in_lane(to_middle, lanes, lane_width_m, offsets)
-    l, m, r = _on_marking(to_middle, lanes, lane_width_m, offsets)
+    ml, mr = in_lane_distances(to_middle, lanes, lane_width_m, offsets)
+    l, m, r = on_marking_distances(to_middle, lanes, lane_width_m, offsets)
     heading = classify_heading(curvature, curvature_ahead)
     return TrackFeatures(ml, mr, l, m, r, angle, heading)
 
@@ -114,9 +114,11 @@ def measure_pose(
     return measure(to_middle, angle, curvature, ahead, lanes, lane_width_m)
 
 
-def _in_lane(
+def in_lane_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float, float] | tuple[None, None]:
+    """`ml` and `mr` (m), or None twice if the in-lane system is inactive. The simulator compiles
+    this function and the next one."""
     lane = lane_index(to_middle, lanes, lane_width_m)
     beside = to_middle - lane_centre(lane, lanes, lane_width_m)
     ml = beside - lane_width_m / 2 - offsets[lane][RIGHT_LANE]
@@ -125,9 +127,10 @@ def _in_lane(
     return (ml, mr) if active else (None, None)
 
 
-def _on_marking(
+def on_marking_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float | None, float | None, float | None]:
+    """`l`, `m` and `r` (m); None for an absent one."""
     # Markings are numbered from 0 (leftmost) to `lanes` (rightmost).
     nearest = min(max(round(lanes / 2 - to_middle / lane_width_m), 0), lanes)
     place = to_middle - lane_width_m * (lanes / 2 - nearest)

@@ -6,6 +6,10 @@
     gymnasium.make("driverview/LateralControl-v0", track="circuit", lanes=1, frequency_hz=20)
     gymnasium.make("driverview/DriverView-v0", track="forza", views=("front", "rear"))
 
+many cars in one compiled call (`simulator.env.vector`)
+
+    gymnasium.make_vec("driverview/LateralControl-v0", 256, "vector_entry_point", track="random")
+
 or, without the second import, by Gymnasium's own syntax for names that a module registers:
 
     gymnasium.make("simulator.env:driverview/LateralControl-v0")
@@ -15,70 +19,27 @@ An episode starts 25 m before the line, at rest, unless `reset(options={"s", "to
 truncated after 6500 steps (`max_episode_steps` of `gymnasium.make`).
 """
 
-import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import trackfeatures as tf
 from simulator import register_environments
-from simulator.env.action import Controls, action_space, check_controls, to_command
-from simulator.env.observation import Kind, Observation, ObservationOptions, Observer
-from simulator.env.reward import Ending, EpisodeOptions
-from simulator.env.start import check_start
-from simulator.env.view_renderer import RenderOptions, ViewRenderer
-from simulator.track.catalogue import find_track
-from simulator.varied.road import make_road
-from simulator.vehicle.state import CarState
+from simulator.env.action import action_space, to_command
+from simulator.env.cars import Cars
+from simulator.env.control_step import REWARD, SCORE
+from simulator.env.errors import NotCopyable, ResetNeeded
+from simulator.env.observation import Kind, Observation, Observer, read_from_beams
+from simulator.env.options import OPTIONS, DriveOptions, split_options
+from simulator.env.view_renderer import ViewRenderer
+from simulator.world.fleet import COMMAND_AT
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
+__all__ = ["OPTIONS", "DriveOptions", "DriverView", "LateralControl", "NotCopyable", "ResetNeeded"]
 RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
-
-
-class ResetNeeded(UserError, gym.error.ResetNeeded):
-    """`step` was called before `reset` or after the end of an episode."""
-
-
-class NotCopyable(UserError, TypeError):
-    """An environment cannot be copied or pickled."""
-
-
-@dataclass(frozen=True)
-class DriveOptions:
-    """The road, its traffic and the controls."""
-
-    track: str = "circuit"
-    lanes: int = 1
-    lane_width: float | None = None
-    """m; None: 4.0, or the width drawn for a varied road."""
-    roads: str = "paper"
-    """"varied": lane width, shoulders and lines are drawn from `road_seed`, the look from
-    `light_seed`."""
-    road_seed: int = 0
-    traffic: int = 0
-    """Other cars, 0 to 12."""
-
-    frequency_hz: int = 20
-    """Control steps per second; must divide the physics' 200 Hz."""
-
-    controls: Controls = "steer"
-    """"steer": steering only, at throttle 0.2 in gear 1; "full": steering, throttle, brake and
-    gear."""
-
-    tracks_dir: str | Path | None = None
-    """A further folder to search for tracks."""
-
-    def __post_init__(self) -> None:
-        check_controls(self.controls)
-
-
-OPTIONS = (DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions)
 
 
 class LateralControl(gym.Env[Any, Any]):
@@ -106,34 +67,44 @@ class LateralControl(gym.Env[Any, Any]):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
-        drive, self._episode, observation, picture = _split_options(
+        drive, episode, observation, picture = split_options(
             {"track": track, "lanes": lanes} | options
         )
-        tracks_dir = None if drive.tracks_dir is None else Path(drive.tracks_dir)
-        found = find_track(drive.track, tracks_dir)
-        road = make_road(found, drive.lanes, drive.lane_width, drive.roads, drive.road_seed)
-        self._renderer, self._render_view = ViewRenderer(road, picture), picture.render_view
-        self._observer = Observer(observation.resolved(self.kind), self._renderer)
-        self.world = World(road, traffic=drive.traffic, frequency_hz=drive.frequency_hz)
+        observation = observation.resolved(self.kind)
+        self._cars = Cars(
+            [drive],
+            episode,
+            noise=observation.state_noise,
+            limit=observation.limit,
+            beams=any(map(read_from_beams, observation.sensors)),
+        )
+        self._renderer, self._render_view = (
+            ViewRenderer(self.world.road, picture),
+            picture.render_view,
+        )
+        self._observer = Observer(observation, self._renderer, self._cars.beams_of(0))
         self.render_mode = render_mode
         self.metadata = {**RENDERING, "render_fps": drive.frequency_hz}
         self._controls = drive.controls
         self.action_space: gym.Space[Any] = action_space(drive.controls)
         self.observation_space = self._observer.space
         self._running = False
-        self._score, self._steps = 0.0, 0
+        self._steps = 0
+
+    @property
+    def world(self) -> World:
+        """The world of the present episode."""
+        return self._cars.world(0)
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
-        start = check_start(options or {}, self.world.road)
-        episode = int(self.np_random.integers(2**31))
-        state = self.world.reset(seed=episode, **start)
-        self._observer.restart(episode)
+        self._observer.restart(self._cars.reset(0, self.np_random, options or {}))
+        self._renderer.change_road(self.world.road)
         self._running = True
-        self._score, self._steps = 0.0, 0
-        return self._observe(state, None)
+        self._steps = 0
+        return self._observe()
 
     def step(
         self, action: NDArray[np.float32]
@@ -143,14 +114,17 @@ class LateralControl(gym.Env[Any, Any]):
                 "there is no episode to step in; call reset() before the first step, "
                 "and after each episode"
             )
-        state = self.world.step(to_command(action, self._controls))
-        ending = self._episode.ending(state)
-        reward = self._episode.compute_reward(state, self.world.road, ending)
-        self._running = ending is None
-        self._score += reward
+        command = to_command(action, self._controls)
+        self._cars.fleet.cars[0, COMMAND_AT : COMMAND_AT + 4] = (
+            *(command.steer, command.throttle),
+            *(command.brake, command.gear),
+        )
+        self._cars.step((self.np_random,))
+        ended = self._cars.ending(0) is not None
+        self._running = not ended
         self._steps += 1
-        observation, info = self._observe(state, ending)
-        return observation, reward, ending is not None, False, info
+        observation, info = self._observe()
+        return observation, float(self._cars.results[0, REWARD]), ended, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """`render_view` (H, W, 3) with `render_mode="rgb_array"`, else None."""
@@ -165,7 +139,7 @@ class LateralControl(gym.Env[Any, Any]):
     def close(self) -> None:
         self._running = False
         self._renderer.close()
-        self.world.close()
+        self._cars.close()
 
     def __getstate__(self) -> NoReturn:
         # A copy would share the physics and graphics of the original.
@@ -174,13 +148,11 @@ class LateralControl(gym.Env[Any, Any]):
             "or pass a function that makes it"
         )
 
-    def _observe(
-        self, state: CarState, ending: Ending | None
-    ) -> tuple[Observation, dict[str, Any]]:
-        features = self.world.features()
-        observation = self._observer.observe(self.world, features, self.np_random)
+    def _observe(self) -> tuple[Observation, dict[str, Any]]:
+        cars, state = self._cars, self.world.state
+        observation = self._observer.observe(self.world, cars.states[0].copy())
         return observation, {
-            "score": self._score,
+            "score": float(cars.results[0, SCORE]),
             "steps": self._steps,
             "time_s": state.time_s,
             "lap": state.lap,
@@ -191,8 +163,8 @@ class LateralControl(gym.Env[Any, Any]):
             "speed_kmh": state.speed_kmh,
             "rpm": state.rpm,
             "collision": state.collision or "",
-            "ended": ending or "",
-            "features": _feature_values(features),
+            "ended": cars.ending(0) or "",
+            "features": cars.features(0),
         }
 
 
@@ -203,35 +175,6 @@ class DriverView(LateralControl):
     """
 
     kind: ClassVar[Kind] = "dict"
-
-
-def _split_options(
-    given: dict[str, Any],
-) -> tuple[DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions]:
-    """The four groups of options from keyword arguments. Raises UserError for an unknown one."""
-    names = [field.name for group in OPTIONS for field in fields(group)]
-    for name in given:
-        if name not in names:
-            close = difflib.get_close_matches(name, names, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"it takes {', '.join(names)}"
-            raise UserError(f"the environment has no option {name!r}; {hint}")
-    drive, episode, observation, picture = (
-        {field.name: given[field.name] for field in fields(group) if field.name in given}
-        for group in OPTIONS
-    )
-    return (
-        DriveOptions(**drive),
-        EpisodeOptions(**episode),
-        ObservationOptions(**observation),
-        RenderOptions(**picture),
-    )
-
-
-def _feature_values(features: tf.TrackFeatures) -> dict[str, float]:
-    """The features that are present; absent ones are left out, as Gymnasium's vectors expect."""
-    given = features.distances | {"to_lane_centre": features.to_lane_centre}
-    present = {name: value for name, value in given.items() if value is not None}
-    return present | {"angle": features.angle, "heading": int(features.heading)}
 
 
 register_environments()

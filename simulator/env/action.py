@@ -1,10 +1,14 @@
 """Actions of the environments: the steering alone, or the paper's four commands."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
+from simulator.arrays import FloatArray
 from simulator.bounds import clip_rounding
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR
 from simulator.vehicle.state import Command
@@ -40,10 +44,7 @@ def to_command(action: Any, controls: Controls) -> Command:
     """The command for `action`; the gear is rounded. Values that exceed their bounds by the
     rounding of float32 are clipped. Raises UserError for values further outside the space."""
     names = NAMES[controls]
-    try:
-        values = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError) as error:  # torch raises RuntimeError
-        raise UserError(f"the action {action!r} is no array of numbers: {error}") from error
+    values = _numbers("action", action)
     if values.shape != (len(names),):
         raise UserError(
             f"the action is {action!r}; give {len(names)} number(s), shape ({len(names)},): "
@@ -58,6 +59,47 @@ def to_command(action: Any, controls: Controls) -> Command:
         return Command(steer=numbers[0], throttle=THROTTLE, gear=GEAR)
     steer, throttle, brake, gear = numbers
     return Command(steer=steer, throttle=throttle, brake=brake, gear=round(gear))
+
+
+def to_rows(actions: Any, controls: Controls, moving: NDArray[np.bool_]) -> FloatArray:
+    """Steer, throttle, brake and gear (N, 4) of the cars that are `moving` (N,), as `to_command`
+    makes them from each of `actions` (N, k). Raises UserError that names the car."""
+    names = NAMES[controls]
+    values = _numbers("actions", actions)
+    if values.shape != (len(moving), len(names)):
+        raise UserError(
+            f"the actions have shape {values.shape}; give one row a car, shape "
+            f"({len(moving)}, {len(names)}): {', '.join(names)}"
+        )
+    rows = np.empty((len(moving), len(LIMITS)))
+    rows[:] = 0.0, THROTTLE, 0.0, GEAR
+    rows[:, : len(names)] = values
+    low, high = np.array([LIMITS[name] for name in names]).T
+    inside = ((values >= low) & (values <= high)).all(axis=1)  # false for NaN too
+    for number in np.flatnonzero(moving & ~inside).tolist():
+        with naming_car(number, len(moving)):
+            command = to_command(values[number], controls)
+        rows[number] = command.steer, command.throttle, command.brake, command.gear
+    rows[:, 3] = np.rint(rows[:, 3])
+    return rows
+
+
+@contextmanager
+def naming_car(number: int, count: int) -> Iterator[None]:
+    """Put the number of the car before the message of an error, if there are several cars."""
+    try:
+        yield
+    except UserError as error:
+        if count > 1:
+            error.args = (f"car {number}: {error}", *error.args[1:])
+        raise
+
+
+def _numbers(what: str, given: Any) -> FloatArray:
+    try:
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:  # torch raises RuntimeError
+        raise UserError(f"the {what} {given!r} is no array of numbers: {error}") from error
 
 
 def _clip(name: str, value: float, low: float, high: float) -> float:

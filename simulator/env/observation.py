@@ -9,13 +9,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import trackfeatures as tf
+from simulator.arrays import FloatArray
 from simulator.env.view_renderer import ViewRenderer
 from simulator.sensors.sensor import Reading, Sensor, SensorSuite
-from simulator.sensors.standard import CAMERA, picture_sensor, sensors_of
+from simulator.sensors.standard import CAMERA, picture_sensor, read_track_range, sensors_of
 from simulator.world.world import World
 from trackfeatures.errors import UserError
-from trackfeatures.state_vector import STATE_SIZE, state_vector
+from trackfeatures.state_vector import STATE_SIZE
 
 Kind = Literal["state", "image", "dict"]
 Observation = dict[str, NDArray[Any]] | NDArray[Any]
@@ -62,6 +62,11 @@ class ObservationOptions:
         """Standard deviation of the noise on the state."""
         return PAPER_STATE_NOISE if self.noise is True else float(self.noise)
 
+    @property
+    def limit(self) -> float:
+        """Bound of the state; with noise it is wider by ten standard deviations."""
+        return STATE_LIMIT * (1.0 + self.state_noise)
+
     def resolved(self, kind: Kind) -> "ObservationOptions":
         """A copy with `observation` and `views` filled in for an environment of this `kind`.
 
@@ -84,30 +89,41 @@ class ObservationOptions:
 
 
 class Observer:
-    """Builds an environment's observations; `options` must be resolved."""
+    """Builds the observations of one car; `options` must be resolved.
 
-    def __init__(self, options: ObservationOptions, renderer: ViewRenderer) -> None:
-        self._kind, self._noise = options.observation, options.state_noise
+    `beams` (19,): the range meter's distances (m) of the current state; None: they are computed
+    when the sensor is read.
+    """
+
+    def __init__(
+        self, options: ObservationOptions, renderer: ViewRenderer, beams: FloatArray | None = None
+    ) -> None:
+        self._kind = options.observation
         self._renderer = renderer
         self.views = tuple(options.views or ())
-        self.suite = SensorSuite(
-            sensors_of(self._replace_camera_sensor(options.sensors)), noise=options.sensor_noise
+        sensors = sensors_of(self._replace_camera(options.sensors))
+        from_beams = [sensor.name for sensor in sensors if read_from_beams(sensor)]
+        if beams is not None:
+            sensors = tuple(
+                replace(sensor, read=lambda world: beams) if sensor.name in from_beams else sensor
+                for sensor in sensors
+            )
+        self.suite = SensorSuite(sensors, noise=options.sensor_noise)
+        self.batched = not self.views and all(
+            sensor.name in from_beams and not sensor.noise for sensor in self.suite.sensors
         )
-        # The bounds of a noisy state are wider by ten standard deviations.
-        self._limit = STATE_LIMIT * (1.0 + self._noise)
+        """Whether the observation consists of the state and of exact range beams only."""
+        self._limit = options.limit
         self.space = self._space()
 
     def restart(self, seed: int) -> None:
         """Seed the sensors' noise for an episode."""
         self.suite.restart(seed)
 
-    def observe(
-        self, world: World, features: tf.TrackFeatures, rng: np.random.Generator
-    ) -> Observation:
-        """The observation of the current state; `rng` draws the noise on the state."""
+    def observe(self, world: World, state: NDArray[np.float32]) -> Observation:
+        """The observation of the current state; `state` (7,) is a part of it."""
         if self._kind == "image":
             return self._renderer.render(world, self.views)[self.views[0]]
-        state = self._state(world, features, rng)
         if self._kind == "state":
             return state
         observed: dict[str, NDArray[Any]] = {STATE: state}
@@ -119,19 +135,6 @@ class Observer:
         ):
             observed[sensor.name] = _as_array(reading, sensor.dtype)
         return observed
-
-    def _state(
-        self, world: World, features: tf.TrackFeatures, rng: np.random.Generator
-    ) -> NDArray[np.float32]:
-        now = world.state
-        vector = state_vector(
-            *(now.to_middle, now.angle, now.vx, now.vy, features.heading),
-            half_width=world.road.half_width,
-        )
-        if self._noise:
-            vector += rng.normal(0.0, self._noise, size=STATE_SIZE)
-        within = np.minimum(np.maximum(vector, -self._limit), self._limit)
-        return np.asarray(within, dtype=np.float32)
 
     def _space(self) -> gym.Space[Any]:
         state = gym.spaces.Box(-self._limit, self._limit, (STATE_SIZE,), np.float32)
@@ -149,13 +152,18 @@ class Observer:
     def _key(self, view: str) -> str:
         return IMAGE if len(self.views) == 1 else view
 
-    def _replace_camera_sensor(self, sensors: Sequence[str | Sensor]) -> list[str | Sensor]:
+    def _replace_camera(self, sensors: Sequence[str | Sensor]) -> list[str | Sensor]:
         """Replace the name "camera" by a sensor that renders the driver's view."""
         renderer = self._renderer
         camera = picture_sensor(
             CAMERA, lambda world: renderer.render(world, ("front",))["front"], renderer.shape
         )
         return [camera if sensor == CAMERA else sensor for sensor in sensors]
+
+
+def read_from_beams(sensor: str | Sensor) -> bool:
+    """Whether a sensor is the range meter, whose beams the control step computes."""
+    return sensor != CAMERA and sensors_of([sensor])[0].read is read_track_range
 
 
 def _sensor_space(sensor: Sensor) -> gym.spaces.Box:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from runtime.jit import compiled
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState
@@ -24,20 +25,41 @@ Reward = Callable[[CarState, Road, Ending | None], float]
 """Reward function of (state after the step, road, why the episode ends or None)."""
 
 
-def ending(state: CarState, ends: Collection[Ending] = ENDINGS) -> Ending | None:
-    """The event out of `ends` that ends an episode at `state`; None if the episode continues.
-    Contact with a wall counts as "off_track"; if that is not among `ends`, as "collision".
-    Contact with a wall counts as "off_track"; if that is not among `ends`, as "collision".
+@compiled
+def ending_code(off_track: bool, backwards: bool, wall: bool, touched: bool, ends: int) -> int:
+    """One more than the index into ENDINGS of the event that ends an episode; 0 if it continues.
+
+    wall: the car touches a wall; touched: it touches anything; ends: `ends_code` of the events that
+    end an episode. Contact with a wall counts as "off_track"; if that does not end an episode, as
+    "collision".
     """
     # Walls stand 2.5 m beyond the edge, so the car is off the track before it touches one. The
     # contact counts even if the car is back on the road by the end of the same control step.
-    if (state.off_track or state.collision == "wall") and "off_track" in ends:
-        return "off_track"
-    if state.backwards and "backwards" in ends:
-        return "backwards"
-    return "collision" if state.collision is not None and "collision" in ends else None
+    if (off_track or wall) and ends & 1:
+        return 1
+    if backwards and ends & 2:
+        return 2
+    return 3 if touched and ends & 4 else 0
 
 
+def ends_code(ends: Collection[Ending]) -> int:
+    """The events as bits, in the order of ENDINGS."""
+    return sum(1 << k for k, event in enumerate(ENDINGS) if event in ends)
+
+
+ALL_ENDS = ends_code(ENDINGS)
+
+
+def ending(state: CarState, ends: Collection[Ending] = ENDINGS) -> Ending | None:
+    """The event out of `ends` that ends an episode at `state`; None if the episode continues."""
+    touched, bits = state.collision, ALL_ENDS if ends is ENDINGS else ends_code(ends)
+    code = ending_code(
+        state.off_track, state.backwards, touched == "wall", touched is not None, bits
+    )
+    return ENDINGS[code - 1] if code else None
+
+
+@compiled
 def step_reward(
     angle: float,
     to_middle: float,
@@ -100,16 +122,9 @@ class EpisodeOptions:
                 f"{', '.join(ENDINGS)}"
             )
 
-    def ending(self, state: CarState) -> Ending | None:
-        """The reason why the episode ends at `state`, None if it goes on."""
-        return ending(state, self.ends)
-
     def compute_reward(self, state: CarState, road: Road, ended: Ending | None) -> float:
-        """The reward of a step that led to `state`. Raises UserError if it is not finite."""
-        if self.reward is None:
-            return step_reward(
-                state.angle, state.to_middle, road.half_width, ended is not None, self.lambda_
-            )
+        """The `reward` of a step that led to `state`. Raises UserError if it is not finite."""
+        assert self.reward is not None
         reward = float(self.reward(state, road, ended))
         if not math.isfinite(reward):
             raise UserError(

@@ -63,6 +63,12 @@ class ViewRenderer:
         self._rendered_state: CarState | None = None
         self._images: dict[str, NDArray[Any]] = {}
 
+    def change_road(self, road: Road) -> None:
+        """Render views of another road from now on."""
+        if road is not self._road:
+            self.close()
+            self._road = road
+
     def space(self, view: str) -> gym.spaces.Box:
         """The observation space of `view`. Raises UserError for an unknown view."""
         from simulator.camera.core.optics import FAR_M

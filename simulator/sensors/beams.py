@@ -6,7 +6,7 @@ import numpy as np
 
 from runtime.jit import compiled
 from simulator.arrays import FloatArray
-from simulator.track.piece_table import CURVATURE, HEADING0, LENGTH, X0, Y0, Table, locate
+from simulator.track.piece_table import COS0, CURVATURE, LENGTH, SIN0, X0, Y0, Table, locate
 
 RANGE_M = 200.0
 OFF_TRACK = -1.0
@@ -51,7 +51,7 @@ def edge_distance(
     cos_d, sin_d = math.cos(direction), math.sin(direction)
     passed, last_move = 0.0, 0
     for _ in range(MOST_PIECES):
-        cos_h, sin_h = math.cos(table[piece, HEADING0]), math.sin(table[piece, HEADING0])
+        cos_h, sin_h = table[piece, COS0], table[piece, SIN0]
         k = table[piece, CURVATURE]
         # The ray (u, v) + t (cu, cv) in the frame of the piece's start.
         dx, dy = x - table[piece, X0], y - table[piece, Y0]

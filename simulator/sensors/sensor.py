@@ -77,7 +77,7 @@ class Sensor:
                 f"shape {self.shape}; set Sensor(..., shape={np.shape(exact)})"
             )
         if isinstance(exact, np.ndarray):
-            return self._measured_array(exact, rng)
+            return self.limit(exact, rng)
         value = float(exact)
         if value == self.invalid:
             return value
@@ -85,7 +85,8 @@ class Sensor:
             value += rng.normal(0.0, self.noise)
         return min(max(value, self.limits[0]), self.limits[1])
 
-    def _measured_array(self, exact: NDArray[Any], rng: np.random.Generator | None) -> NDArray[Any]:
+    def limit(self, exact: NDArray[Any], rng: np.random.Generator | None = None) -> NDArray[Any]:
+        """`exact` readings of any shape, clipped to the limits; noisy if `rng` is given."""
         noisy = exact if rng is None else exact + rng.normal(0.0, self.noise, size=exact.shape)
         if exact.dtype.kind in "iu":
             noisy = np.rint(noisy)

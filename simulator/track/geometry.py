@@ -114,7 +114,9 @@ class Track:
         """SHA-256 (hex) of the geometry; it does not depend on the track's name."""
         return (
             self.definition_hash
-            or hashlib.sha256(self.arrays().astype("<f8").tobytes()).hexdigest()
+            or hashlib.sha256(
+                self.arrays()[:, : piece_table.GEOMETRY].astype("<f8").tobytes()
+            ).hexdigest()
         )
 
     @cached_property
@@ -132,10 +134,11 @@ class Track:
         table[:, piece_table.Z_RIGHT1] = self.z_right1
         table[:, piece_table.HALF_WIDTH] = self.width / 2
         table[:, piece_table.TRACK_LENGTH] = self.length_m
+        piece_table.complete_table(table)
         return table
 
     def arrays(self) -> FloatArray:
-        """The C-contiguous (P, 12) table that the functions of `piece_table` take."""
+        """The C-contiguous (P, 16) table that the functions of `piece_table` take."""
         return self._table
 
     def at(self, s: ArrayLike, y: ArrayLike = 0.0) -> TrackPose:

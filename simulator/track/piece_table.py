@@ -1,4 +1,4 @@
-"""Compiled functions on the table of a track: (P, 12), one row a constant-curvature piece.
+"""Compiled functions on the table of a track: (P, 16), one row a constant-curvature piece.
 
 A piece is a straight or an arc of the centre line with edge heights linear in its arc length.
 World frame (x, y plane, z up); s along the centre line, to_middle left positive; metres, radians.
@@ -9,14 +9,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 
 Table = NDArray[np.float64]
 
 S0, LENGTH, X0, Y0, HEADING0, CURVATURE = 0, 1, 2, 3, 4, 5
 Z_LEFT0, Z_RIGHT0, Z_LEFT1, Z_RIGHT1 = 6, 7, 8, 9
 HALF_WIDTH, TRACK_LENGTH = 10, 11
-COLUMNS = 12
+GEOMETRY = 12
+"""The columns so far define the track; the others are computed from them once."""
+COS0, SIN0, LEFT_SLOPE, RIGHT_SLOPE = 12, 13, 14, 15
+COLUMNS = 16
 
 MAX_WALK = 64
 """Pieces by which a hint can be wrong before all pieces are searched."""
@@ -24,7 +27,7 @@ HINT_REACH_M = 40.0
 """A foot point farther away than this is not trusted to be on the hinted part of the track."""
 
 
-@compiled
+@inlined
 def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
     """Foot point of (x, y) on piece `index`, extended beyond both ends: (local s, to_middle).
 
@@ -33,8 +36,7 @@ def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
     """
     dx = x - table[index, X0]
     dy = y - table[index, Y0]
-    cos_h = math.cos(table[index, HEADING0])
-    sin_h = math.sin(table[index, HEADING0])
+    cos_h, sin_h = table[index, COS0], table[index, SIN0]
     u = dx * cos_h + dy * sin_h
     v = -dx * sin_h + dy * cos_h
     k = table[index, CURVATURE]
@@ -59,6 +61,16 @@ def centre_point(table: Table, index: int, along: float) -> tuple[float, float]:
 
 
 @compiled
+def complete_table(table: Table) -> None:
+    """Fill the columns that are computed from others."""
+    for index in range(table.shape[0]):
+        row = table[index]
+        row[COS0], row[SIN0] = math.cos(row[HEADING0]), math.sin(row[HEADING0])
+        row[LEFT_SLOPE] = (row[Z_LEFT1] - row[Z_LEFT0]) / row[LENGTH]
+        row[RIGHT_SLOPE] = (row[Z_RIGHT1] - row[Z_RIGHT0]) / row[LENGTH]
+
+
+@compiled
 def index_at(table: Table, s: float) -> int:
     """Index of the piece that holds `s`; s wraps round the lap."""
     wrapped = wrap(table, s)
@@ -67,6 +79,18 @@ def index_at(table: Table, s: float) -> int:
 
 
 @compiled
+def index_near(table: Table, s: float, hint: int) -> int:
+    """`index_at`, faster if `s` is on piece `hint` or on one of the next."""
+    wrapped, count = wrap(table, s), table.shape[0]
+    for index in range(hint, min(hint + MAX_WALK, count)):
+        if wrapped < table[index, S0]:
+            break
+        if index + 1 == count or wrapped < table[index + 1, S0]:
+            return index
+    return index_at(table, s)
+
+
+@inlined
 def wrap(table: Table, s: float) -> float:
     """`s` brought into [0, track length)."""
     total = table[0, TRACK_LENGTH]
@@ -98,7 +122,7 @@ def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, flo
     return best, wrap(table, table[best, S0] + best_s), best_d
 
 
-@compiled
+@inlined
 def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, float, float]:
     """Track coordinates of a world point: (piece index, s, to_middle).
 
@@ -129,7 +153,7 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
     return locate_everywhere(table, x, y)
 
 
-@compiled
+@inlined
 def surface(
     table: Table, index: int, s: float, to_middle: float
 ) -> tuple[float, float, float, float]:
@@ -139,8 +163,7 @@ def surface(
     """
     length = table[index, LENGTH]
     along = min(max(s - table[index, S0], 0.0), length)
-    left_slope = (table[index, Z_LEFT1] - table[index, Z_LEFT0]) / length
-    right_slope = (table[index, Z_RIGHT1] - table[index, Z_RIGHT0]) / length
+    left_slope, right_slope = table[index, LEFT_SLOPE], table[index, RIGHT_SLOPE]
     left = table[index, Z_LEFT0] + left_slope * along
     right = table[index, Z_RIGHT0] + right_slope * along
     width = 2.0 * table[index, HALF_WIDTH]
@@ -151,7 +174,10 @@ def surface(
     stretch = max(1.0 - k * to_middle, 0.05)
     slope = (0.5 * (left_slope + right_slope) + share * (left_slope - right_slope)) / stretch
     heading = table[index, HEADING0] + k * along
-    cos_h, sin_h = math.cos(heading), math.sin(heading)
+    if heading == table[index, HEADING0]:  # on a straight
+        cos_h, sin_h = table[index, COS0], table[index, SIN0]
+    else:
+        cos_h, sin_h = math.cos(heading), math.sin(heading)
     gx = slope * cos_h - across * sin_h
     gy = slope * sin_h + across * cos_h
     norm = math.sqrt(1.0 + gx * gx + gy * gy)

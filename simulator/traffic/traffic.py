@@ -53,7 +53,9 @@ class Traffic:
         markings = road.markings_y
         self._lane_y = 0.5 * (markings[:-1] + markings[1:])
         start = self._length - START_BEFORE_LINE_M if ego_s is None else ego_s
-        self._limit = _curve_speed_limits(road.track, float(np.max(self._lane_y)))
+        self._limit = (
+            _curve_speed_limits(road.track, float(np.max(self._lane_y))) if count else np.zeros(1)
+        )
         self._cars = self._initial_cars(count, rng, start % self._length)
         self._bodies = np.zeros((count + 1, car_table.BODY_COLUMNS))
         self._poses = np.zeros((count, 6))

@@ -7,6 +7,7 @@ distances (lf, lr) are also the paper's. Two values differ from the paper: its y
 125 kN/rad; with the paper's values it deviates twice as far in the kink of g-track-3.
 """
 
+import math
 from dataclasses import astuple, dataclass, fields
 from typing import Any
 
@@ -163,14 +164,18 @@ class CarParameters:
         return float(self.tyre_stiffness * self.friction * nominal * gain * grip * load)
 
     def packed(self) -> NDArray[Any]:
-        """The parameters and derived loads as a structured array (1,), for compiled code."""
+        """The parameters and numbers derived from them: an array (1,) for compiled code."""
         layout = [
             (field.name, "f8", (len(value),) if isinstance(value, tuple) else ())
             for field, value in zip(fields(self), astuple(self), strict=True)
         ]
         layout += [(name, "f8", ()) for name in ("total_mass", "load_front", "load_rear")]
         layout += [(name, "f8", ()) for name in ("working_front", "working_rear")]
+        layout += [(name, "f8", ()) for name in ("friction_rate", "tyre_slope")]
         front, rear = self.static_loads
         nominal = self.working_load * self.mass / self.total_mass
-        derived = (self.total_mass, front, rear, nominal * front, nominal * rear)
+        spread = self.friction_unloaded - self.friction_overloaded
+        rate = math.log((1.0 - self.friction_overloaded) / spread)
+        slope = self.tyre_stiffness / self.tyre_shape
+        derived = (self.total_mass, front, rear, nominal * front, nominal * rear, rate, slope)
         return np.array([(*astuple(self), *derived)], dtype=layout)

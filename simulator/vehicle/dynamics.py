@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.car import GRAVITY
-from simulator.vehicle.orientation import rotation
+from simulator.vehicle.orientation import fill_axes
 from simulator.vehicle.powertrain import (
     clutch,
     free_engine_speed,
@@ -27,6 +27,7 @@ from simulator.vehicle.wheels import (
     WHEEL,
     add_tyre_forces,
     locate_contacts,
+    turn_wheels,
     tyre_slip_gains,
     update_loads,
 )
@@ -44,7 +45,33 @@ UNDERBODY_CLEARANCE_M = 0.10
 UNDERBODY_SPRING, UNDERBODY_DAMPER = 500_000.0, 20_000.0
 
 
+Work = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Memory for one physics step, reused in the next: axes (3, 3), wheels (4, WHEEL), slip gains (4,),
+velocity (6,), turned wheels (9,), wrench (6,)."""
+
+
 @compiled
+def make_work() -> Work:
+    """Memory for the physics steps of one car."""
+    work = (
+        np.empty((3, 3)),
+        np.empty((4, WHEEL)),
+        np.empty(4),
+        np.empty(6),
+        np.empty(9),
+        np.empty(6),
+    )
+    forget_turn(work)
+    return work
+
+
+@compiled
+def forget_turn(work: Work) -> None:
+    """Let the next step compute the wheels' turn, because it may be another car's."""
+    work[4][0] = math.nan
+
+
+@inlined
 def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
     """Front-wheel angle (rad) after `dt` s of turning towards `command` in [-1, 1]."""
     step = p.steering_rate * dt
@@ -52,7 +79,7 @@ def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
     return float(angle + min(max(wanted - angle, -step), step))
 
 
-@compiled
+@inlined
 def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
     """Wheel speed (rad/s) after a brake torque `brake` (N m) has acted on `spin` for `dt` s; it
     stops the wheel but never reverses it."""
@@ -111,11 +138,10 @@ def update_wheel_speeds(
         memory[ENGINE], _, _ = clutch(p, 0.5 * (spin[2] + spin[3]) * ratio, command[1])
 
 
-@compiled
+@inlined
 def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: FloatArray) -> None:
     """Add drag along the body and downforce at both axles (quadratic in the forward speed)."""
-    ahead, up = axes[0], axes[2]
-    speed = ahead[0] * velocity[0] + ahead[1] * velocity[1] + ahead[2] * velocity[2]
+    speed = axes[0, 0] * velocity[0] + axes[0, 1] * velocity[1] + axes[0, 2] * velocity[2]
     pressure = 0.5 * p.air_density * speed * speed
     drag = pressure * (p.drag_coefficient * p.frontal_area + p.wing_drag)
     if speed < 0.0:
@@ -124,11 +150,11 @@ def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: Flo
     # Pitch torque of the downforce at the axles, about the body's left axis.
     turn = p.front_axle * front - p.rear_axle * rear
     for i in range(3):
-        wrench[i] -= drag * ahead[i] + (front + rear) * up[i]
+        wrench[i] -= drag * axes[0, i] + (front + rear) * axes[2, i]
         wrench[3 + i] += turn * axes[1, i]
 
 
-@compiled
+@inlined
 def add_underbody_contact(
     depth: float, normal: tuple[float, float, float], velocity: FloatArray, wrench: FloatArray
 ) -> None:
@@ -143,7 +169,7 @@ def add_underbody_contact(
         wrench[2] += push * nz
 
 
-@compiled
+@inlined
 def accelerate(
     p: Any, axes: FloatArray, wrench: FloatArray, dt: float, velocity: FloatArray
 ) -> None:
@@ -174,24 +200,47 @@ def compute_forces(
     200 Hz, and with the present velocity yaw would settle as if the car had 15 % less inertia.
     params: `CarParameters.packed()`; command: steer, throttle, brake in their ranges, and gear.
     """
-    p = params[0]
-    wheels, slip_gain, spin = np.empty((4, WHEEL)), np.empty(4), memory[SPIN : SPIN + 4]
-    axes = rotation(motion[3:7])
-    piece, s, d = locate(table, motion[0], motion[1], int(memory[PIECE]))
+    work = make_work()
+    fill_axes(motion[3:7], work[0])
+    at = locate(table, motion[0], motion[1], int(memory[PIECE]))
+    compute_forces_at(params[0], table, ground, at, motion, memory, command, work)
+    for i in range(6):
+        wrench[i] = work[5][i]
+
+
+@inlined
+def compute_forces_at(
+    p: Any,
+    table: Table,
+    ground: Ground,
+    at: tuple[int, float, float],
+    motion: FloatArray,
+    memory: FloatArray,
+    command: FloatArray,
+    work: Work,
+) -> None:
+    """`compute_forces` of a car whose place `at` (see `locate`) and axes in `work` are at hand; the
+    wrench is left in `work`."""
+    axes, wheels, slip_gain, velocity, turned, wrench = work
+    spin = memory[SPIN : SPIN + 4]
+    piece, s, d = at
     memory[PIECE] = piece
     z, nx, ny, nz = surface(table, piece, s, d)
     depth = UNDERBODY_CLEARANCE_M - (motion[2] - z) * nz
     before = memory[STEER]
     memory[STEER] = move_steering(p, before, command[0], DT)
-    locate_contacts(p, table, ground, piece, motion, axes, 0.5 * (before + memory[STEER]), wheels)
-    velocity = motion[7:13].copy()
+    turn_wheels(p, 0.5 * (before + memory[STEER]), turned)
+    locate_contacts(p, table, ground, piece, motion, axes, turned, wheels)
+    for i in range(6):
+        velocity[i] = motion[7 + i]
     for stage in range(2):
         update_loads(p, velocity, wheels)
         tyre_slip_gains(p, spin, wheels, slip_gain)
         if stage == 1:
             update_wheel_speeds(p, memory, command, wheels, slip_gain)
             tyre_slip_gains(p, spin, wheels, slip_gain)
-        wrench[:] = 0.0
+        for i in range(6):
+            wrench[i] = 0.0
         wrench[2] = -p.total_mass * GRAVITY
         add_tyre_forces(p, spin, wheels, slip_gain, wrench)
         add_aerodynamics(p, axes, velocity, wrench)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 
 
 def quaternion(
@@ -34,8 +34,15 @@ def quaternion(
 def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Body axes (forward, left, up) as the rows of a (3, 3) matrix, from a unit quaternion
     (x, y, z, w)."""
-    x, y, z, w = quaternion
     axes = np.empty((3, 3))
+    fill_axes(quaternion, axes)
+    return axes
+
+
+@inlined
+def fill_axes(quaternion: NDArray[np.float64], axes: NDArray[np.float64]) -> None:
+    """Fill `axes` (3, 3), as `rotation`."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     axes[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     axes[0, 1] = 2.0 * (x * y + w * z)
     axes[0, 2] = 2.0 * (x * z - w * y)
@@ -45,4 +52,3 @@ def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     axes[2, 0] = 2.0 * (x * z + w * y)
     axes[2, 1] = 2.0 * (y * z - w * x)
     axes[2, 2] = 1.0 - 2.0 * (x * x + y * y)
-    return axes

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 from simulator.vehicle.car import RPM, TORQUE_RPM_STEP
 
 
-@compiled
+@inlined
 def gear_ratio(p: Any, gear: int) -> float:
     """Engine speed over rear-wheel speed; negative in reverse, 0 in neutral."""
     if gear > 0:
@@ -16,7 +16,7 @@ def gear_ratio(p: Any, gear: int) -> float:
     return 0.0
 
 
-@compiled
+@inlined
 def engine_torque(p: Any, speed: float, throttle: float) -> float:
     """Torque (N m) at the crankshaft at `speed` rad/s.
 
@@ -32,7 +32,7 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
     return float(full * (opened * (1.0 + braking) - braking))
 
 
-@compiled
+@inlined
 def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
     """Mean speed (rad/s) of the driven wheels, held where the engine turns at `top_rpm`.
 
@@ -49,7 +49,7 @@ def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float
     return float(min(max(faster, p.idle_rpm / RPM), p.top_rpm / RPM))
 
 
-@compiled
+@inlined
 def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, float]:
     """(engine speed, torque, inertia) at the gearbox input shaft turning at `shaft_speed` rad/s.
 

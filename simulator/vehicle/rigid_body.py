@@ -7,15 +7,13 @@ same whether PyBullet or this code moves the body. World frame, SI units.
 import math
 from typing import Any
 
-import numpy as np
-
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 from simulator.arrays import FloatArray
 from simulator.vehicle.dynamics import DT, accelerate
 from simulator.vehicle.orientation import rotation
 
 
-@compiled
+@inlined
 def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
     """Change of the angular velocity (body frame, rad/s) by one step of Euler's equations without
     torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
@@ -36,7 +34,7 @@ def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[flo
     return -gx / determinant, -gy / determinant, -gz / determinant
 
 
-@compiled
+@inlined
 def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -> None:
     """Rotate a unit quaternion (x, y, z, w) by the angular velocity (world frame) over `dt`."""
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
@@ -44,18 +42,26 @@ def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -
     # sin(half) / rate without cancellation at rest.
     scale = 0.5 * dt - dt**3 * rate * rate / 48.0 if rate < 1e-3 else math.sin(half) / rate
     ax, ay, az, aw = wx * scale, wy * scale, wz * scale, math.cos(half)
-    x, y, z, w = quaternion
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     quaternion[0] = aw * x + ax * w + ay * z - az * y
     quaternion[1] = aw * y + ay * w + az * x - ax * z
     quaternion[2] = aw * z + az * w + ax * y - ay * x
     quaternion[3] = aw * w - ax * x - ay * y - az * z
-    quaternion /= math.sqrt(np.sum(quaternion * quaternion))
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    for i in range(4):
+        quaternion[i] /= length
 
 
 @compiled
 def integrate(p: Any, motion: FloatArray, wrench: FloatArray) -> None:
     """Move a free body by one physics step under `wrench` (6,), (force, torque)."""
-    axes = rotation(motion[3:7])
+    integrate_with(p, rotation(motion[3:7]), motion, wrench)
+
+
+@inlined
+def integrate_with(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
+    """`integrate`, with the body's `axes` (3, 3) at hand."""
     tx, ty, tz = gyroscopic_change(p, axes, motion)
     accelerate(p, axes, wrench, DT, motion[7:13])
     for i in range(3):

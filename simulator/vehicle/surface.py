@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from runtime.jit import compiled
+from runtime.jit import inlined
 from simulator.track.road import Road
 
 
@@ -36,7 +36,7 @@ def ground(road: Road) -> Ground:
     return (surface.grip, surface.rolling, VERGE.grip, VERGE.rolling, road.half_asphalt)
 
 
-@compiled
+@inlined
 def surface_under_wheel(ground: Ground, to_middle: float) -> tuple[float, float]:
     """(grip, rolling) at a lateral offset (m) from the track's centre."""
     if abs(to_middle) > ground[4]:

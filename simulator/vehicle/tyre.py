@@ -6,43 +6,43 @@ The magic formula and the effect of the load are those of the TORCS car model.
 import math
 from typing import Any
 
-from runtime.jit import compiled
+from runtime.jit import inlined
 
 MIN_SLIP_SPEED_M_S = 4.0
 """Least reference speed (m/s) of the slip: a standing tyre then acts as a damper, and the 200 Hz
 integration stays stable (the rate of a stiff tyre grows as one over the speed)."""
 
 
-@compiled
+@inlined
 def slip_force_ratio(
-    slip: float, peak: float, stiffness: float, shape: float, curvature: float
+    slip: float, peak: float, stiffness: float, slope: float, shape: float, curvature: float
 ) -> float:
     """Tyre force per unit of combined slip (N): the secant of the magic formula at `slip`.
 
-    F = D sin(C atan(B s - E (B s - atan(B s)))) with D = `peak` (N) and B C = `stiffness` (Pacejka,
-    Tyre and Vehicle Dynamics, eq. 4.49). The force points along the combined slip (similarity
-    method), so its components lie on the friction ellipse.
+    F = D sin(C atan(B s - E (B s - atan(B s)))) with B = `slope`, C = `shape`, D = `peak` (N) and
+    B C = `stiffness` (Pacejka, Tyre and Vehicle Dynamics, eq. 4.49). The force points along the
+    combined slip (similarity method), so its components lie on the friction ellipse.
     """
     if slip < 1e-9:
         return stiffness * peak
-    linear = stiffness / shape * slip
+    linear = slope * slip
     argument = (1.0 - curvature) * linear + curvature * math.atan(linear)
     return peak * math.sin(shape * math.atan(argument)) / slip
 
 
-@compiled
+@inlined
 def peak_force(p: Any, front: bool, load: float, grip: float) -> float:
     """Largest force (N) of a tyre at `load` (N) on ground of this `grip`; the friction coefficient
     falls with the load."""
     share = load / (p.working_front if front else p.working_rear)
     span = p.friction_unloaded - p.friction_overloaded
-    rate = math.log((1.0 - p.friction_overloaded) / span)  # nominal friction at share 1
-    friction = p.friction * (p.friction_overloaded + span * math.exp(rate * share))
+    # The rate gives the nominal friction at share 1.
+    friction = p.friction * (p.friction_overloaded + span * math.exp(p.friction_rate * share))
     gain = p.camber_gain_front if front else p.camber_gain_rear
     return float(friction * gain * grip * load)
 
 
-@compiled
+@inlined
 def tyre_slip_gain(p: Any, peak: float, along: float, across: float, spin: float) -> float:
     """Tyre force per m/s of slip speed (N s/m), at the present combined slip.
 
@@ -50,5 +50,7 @@ def tyre_slip_gain(p: Any, peak: float, along: float, across: float, spin: float
     """
     reference = max(abs(along), MIN_SLIP_SPEED_M_S)
     slip = math.hypot(spin * p.wheel_radius - along, across) / reference
-    ratio = slip_force_ratio(slip, peak, p.tyre_stiffness, p.tyre_shape, p.tyre_curvature)
+    ratio = slip_force_ratio(
+        slip, peak, p.tyre_stiffness, p.tyre_slope, p.tyre_shape, p.tyre_curvature
+    )
     return ratio / reference

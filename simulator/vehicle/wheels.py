@@ -6,7 +6,7 @@ World frame z up; body frame x forward, y left, z up, origin at the centre of gr
 import math
 from typing import Any
 
-from runtime.jit import compiled
+from runtime.jit import compiled, inlined
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate, surface
 from simulator.vehicle.surface import Ground, surface_under_wheel
@@ -42,7 +42,19 @@ def wheel_angle(p: Any, wheel: int, steer: float) -> float:
     return outer if steer > 0.0 else -outer
 
 
-@compiled
+@inlined
+def turn_wheels(p: Any, steer: float, turned: FloatArray) -> None:
+    """Fill `turned` (9,): `steer`, and the cosine and sine of each wheel's angle. Steering mostly
+    rests, so that they are computed once for several steps."""
+    if turned[0] == steer:
+        return
+    turned[0] = steer
+    for wheel in range(4):
+        angle = wheel_angle(p, wheel, steer)
+        turned[1 + 2 * wheel], turned[2 + 2 * wheel] = math.cos(angle), math.sin(angle)
+
+
+@inlined
 def locate_contacts(
     p: Any,
     table: Table,
@@ -50,51 +62,55 @@ def locate_contacts(
     piece: int,
     motion: FloatArray,
     axes: FloatArray,
-    steer: float,
+    turned: FloatArray,
     wheels: FloatArray,
 ) -> None:
     """Fill the entries of `wheels` that do not depend on the body's velocity: contact point,
     directions, spring force, damper constant and surface.
 
-    axes (3, 3): body axes as rows; steer: front-wheel angle (rad).
+    axes (3, 3): body axes as rows; turned (9,): see `turn_wheels`.
     """
-    ahead, left, up = axes[0], axes[1], axes[2]
     upright = True
     for wheel in range(4):
-        row = wheels[wheel]
         front = wheel < 2
         x = p.front_axle if front else -p.rear_axle
         y = 0.5 * (p.front_track if front else p.rear_track) * (1.0 if wheel % 2 == 0 else -1.0)
-        px = motion[0] + ahead[0] * x + left[0] * y
-        py = motion[1] + ahead[1] * x + left[1] * y
-        pz = motion[2] + ahead[2] * x + left[2] * y
+        px = motion[0] + axes[0, 0] * x + axes[1, 0] * y
+        py = motion[1] + axes[0, 1] * x + axes[1, 1] * y
+        pz = motion[2] + axes[0, 2] * x + axes[1, 2] * y
         at, s, d = locate(table, px, py, piece)
         z, nx, ny, nz = surface(table, at, s, d)
-        upright_cosine = max(up[0] * nx + up[1] * ny + up[2] * nz, MIN_UPRIGHT_COSINE)
+        upright_cosine = max(
+            axes[2, 0] * nx + axes[2, 1] * ny + axes[2, 2] * nz, MIN_UPRIGHT_COSINE
+        )
         reach = (
             (pz - z) * nz / upright_cosine
         )  # along the strut, from the height of the CG to the road
         for i in range(3):
-            row[ARM + i] = ahead[i] * x + left[i] * y - up[i] * reach
-        row[NORMAL], row[NORMAL + 1], row[NORMAL + 2] = nx, ny, nz
-        set_directions(p, row, axes, wheel_angle(p, wheel, steer))
-        row[SPRING] = min(p.cg_height - reach, MAX_TRAVEL_M)  # compression from rest
-        row[DAMPER] = (p.damper_front if front else p.damper_rear) / upright_cosine
+            wheels[wheel, ARM + i] = axes[0, i] * x + axes[1, i] * y - axes[2, i] * reach
+        wheels[wheel, NORMAL], wheels[wheel, NORMAL + 1] = nx, ny
+        wheels[wheel, NORMAL + 2] = nz
+        set_directions(wheels, wheel, axes, turned[1 + 2 * wheel], turned[2 + 2 * wheel])
+        wheels[wheel, SPRING] = min(p.cg_height - reach, MAX_TRAVEL_M)  # compression from rest
+        wheels[wheel, DAMPER] = (p.damper_front if front else p.damper_rear) / upright_cosine
         upright = upright and upright_cosine > MIN_UPRIGHT_COSINE
-        row[GRIP], row[ROLLING] = surface_under_wheel(ground, d)
+        wheels[wheel, GRIP], wheels[wheel, ROLLING] = surface_under_wheel(ground, d)
     for axle in range(2):
         a, b = wheels[2 * axle, SPRING], wheels[2 * axle + 1, SPRING]
         wheels[2 * axle, SPRING] = spring_force(p, axle == 0, a, b)
         wheels[2 * axle + 1, SPRING] = spring_force(p, axle == 0, b, a)
     if not upright:
-        wheels[:, SPRING], wheels[:, DAMPER] = 0.0, 0.0
+        for wheel in range(4):
+            wheels[wheel, SPRING], wheels[wheel, DAMPER] = 0.0, 0.0
 
 
-@compiled
-def set_directions(p: Any, row: FloatArray, axes: FloatArray, angle: float) -> None:
-    """Fill in a wheel's directions in the road plane, `angle` rad to the left of the body's."""
-    cos_a, sin_a = math.cos(angle), math.sin(angle)
-    nx, ny, nz = row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]
+@inlined
+def set_directions(
+    wheels: FloatArray, wheel: int, axes: FloatArray, cos_a: float, sin_a: float
+) -> None:
+    """Fill in a wheel's directions in the road plane, turned to the left of the body's by the angle
+    of this cosine and sine."""
+    nx, ny, nz = wheels[wheel, NORMAL], wheels[wheel, NORMAL + 1], wheels[wheel, NORMAL + 2]
     fx = axes[0, 0] * cos_a + axes[1, 0] * sin_a
     fy = axes[0, 1] * cos_a + axes[1, 1] * sin_a
     fz = axes[0, 2] * cos_a + axes[1, 2] * sin_a
@@ -102,13 +118,14 @@ def set_directions(p: Any, row: FloatArray, axes: FloatArray, angle: float) -> N
     fx, fy, fz = fx - above * nx, fy - above * ny, fz - above * nz
     length = math.sqrt(fx * fx + fy * fy + fz * fz)
     fx, fy, fz = fx / length, fy / length, fz / length
-    row[FORWARD], row[FORWARD + 1], row[FORWARD + 2] = fx, fy, fz
-    row[LEFT] = ny * fz - nz * fy
-    row[LEFT + 1] = nz * fx - nx * fz
-    row[LEFT + 2] = nx * fy - ny * fx
+    wheels[wheel, FORWARD], wheels[wheel, FORWARD + 1] = fx, fy
+    wheels[wheel, FORWARD + 2] = fz
+    wheels[wheel, LEFT] = ny * fz - nz * fy
+    wheels[wheel, LEFT + 1] = nz * fx - nx * fz
+    wheels[wheel, LEFT + 2] = nx * fy - ny * fx
 
 
-@compiled
+@inlined
 def spring_force(p: Any, front: bool, compression: float, other: float) -> float:
     """Force (N) of one wheel's spring, anti-roll bar and bump stop, at `compression` m from rest,
     the other wheel of the axle at `other` m."""
@@ -118,57 +135,90 @@ def spring_force(p: Any, front: bool, compression: float, other: float) -> float
     return float(force + p.bump_spring * max(compression - p.bump_travel, 0.0))
 
 
-@compiled
+@inlined
+def along(wheels: FloatArray, wheel: int, axis: int, vx: float, vy: float, vz: float) -> float:
+    """Component of a velocity along a direction of a wheel's row."""
+    x, y, z = wheels[wheel, axis], wheels[wheel, axis + 1], wheels[wheel, axis + 2]
+    return float(vx * x + vy * y + vz * z)
+
+
+@inlined
 def update_loads(p: Any, velocity: FloatArray, wheels: FloatArray) -> None:
     """Fill the entries of `wheels` that depend on the body's `velocity` (6,), linear and angular:
     contact point speeds, load, largest tyre force."""
     for wheel in range(4):
-        row = wheels[wheel]
-        x, y, z = row[ARM], row[ARM + 1], row[ARM + 2]
+        x, y, z = wheels[wheel, ARM], wheels[wheel, ARM + 1], wheels[wheel, ARM + 2]
         vx = velocity[0] + velocity[4] * z - velocity[5] * y
         vy = velocity[1] + velocity[5] * x - velocity[3] * z
         vz = velocity[2] + velocity[3] * y - velocity[4] * x
-        row[ALONG] = vx * row[FORWARD] + vy * row[FORWARD + 1] + vz * row[FORWARD + 2]
-        row[ACROSS] = vx * row[LEFT] + vy * row[LEFT + 1] + vz * row[LEFT + 2]
-        closing = -(vx * row[NORMAL] + vy * row[NORMAL + 1] + vz * row[NORMAL + 2])
-        row[LOAD] = max(row[SPRING] + row[DAMPER] * closing, 0.0)
-        row[PEAK] = peak_force(p, wheel < 2, row[LOAD], row[GRIP])
+        wheels[wheel, ALONG] = along(wheels, wheel, FORWARD, vx, vy, vz)
+        wheels[wheel, ACROSS] = along(wheels, wheel, LEFT, vx, vy, vz)
+        closing = -along(wheels, wheel, NORMAL, vx, vy, vz)
+        load = max(wheels[wheel, SPRING] + wheels[wheel, DAMPER] * closing, 0.0)
+        wheels[wheel, LOAD] = load
+        wheels[wheel, PEAK] = peak_force(p, wheel < 2, load, wheels[wheel, GRIP])
 
 
-@compiled
+@inlined
 def tyre_slip_gains(p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: FloatArray) -> None:
     """Fill `slip_gain` (4,): tyre force per m/s of slip speed (N s/m); `spin` (4,) rad/s."""
     for wheel in range(4):
-        row = wheels[wheel]
-        slip_gain[wheel] = tyre_slip_gain(p, row[PEAK], row[ALONG], row[ACROSS], spin[wheel])
+        slip_gain[wheel] = tyre_slip_gain(
+            p,
+            wheels[wheel, PEAK],
+            wheels[wheel, ALONG],
+            wheels[wheel, ACROSS],
+            spin[wheel],
+        )
 
 
-@compiled
+@inlined
 def add_tyre_forces(
     p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: FloatArray, wrench: FloatArray
 ) -> None:
     """Add the forces and torques of the road on the four wheels to `wrench` (6,)."""
     for wheel in range(4):
-        row = wheels[wheel]
-        along, load = row[ALONG], row[LOAD]
-        rolling = p.rolling_resistance * row[ROLLING] * load * min(max(along / 0.5, -1.0), 1.0)
-        forward = slip_gain[wheel] * (spin[wheel] * p.wheel_radius - along) - rolling
-        leftward = -slip_gain[wheel] * row[ACROSS]
+        speed, load = wheels[wheel, ALONG], wheels[wheel, LOAD]
+        resistance = p.rolling_resistance * wheels[wheel, ROLLING] * load
+        rolling = resistance * min(max(speed / 0.5, -1.0), 1.0)
+        forward = slip_gain[wheel] * (spin[wheel] * p.wheel_radius - speed) - rolling
+        leftward = -slip_gain[wheel] * wheels[wheel, ACROSS]
         add_force(
             wrench,
-            row[FORWARD] * forward + row[LEFT] * leftward + row[NORMAL] * load,
-            row[FORWARD + 1] * forward + row[LEFT + 1] * leftward + row[NORMAL + 1] * load,
-            row[FORWARD + 2] * forward + row[LEFT + 2] * leftward + row[NORMAL + 2] * load,
-            row[ARM : ARM + 3],
+            component(wheels, wheel, 0, forward, leftward, load),
+            component(wheels, wheel, 1, forward, leftward, load),
+            component(wheels, wheel, 2, forward, leftward, load),
+            wheels[wheel, ARM],
+            wheels[wheel, ARM + 1],
+            wheels[wheel, ARM + 2],
         )
 
 
-@compiled
-def add_force(wrench: FloatArray, fx: float, fy: float, fz: float, arm: FloatArray) -> None:
-    """Add a world-frame force at `arm` (3,) from the centre of gravity to `wrench` (6,)."""
+@inlined
+def component(
+    wheels: FloatArray, wheel: int, axis: int, forward: float, leftward: float, load: float
+) -> float:
+    """World-frame component `axis` (N) of a force given in the directions of a wheel."""
+    ahead = wheels[wheel, FORWARD + axis] * forward
+    return float(
+        ahead + wheels[wheel, LEFT + axis] * leftward + wheels[wheel, NORMAL + axis] * load
+    )
+
+
+@inlined
+def add_force(
+    wrench: FloatArray,
+    fx: float,
+    fy: float,
+    fz: float,
+    arm_x: float,
+    arm_y: float,
+    arm_z: float,
+) -> None:
+    """Add a world-frame force at the arm (m) from the centre of gravity to `wrench` (6,)."""
     wrench[0] += fx
     wrench[1] += fy
     wrench[2] += fz
-    wrench[3] += arm[1] * fz - arm[2] * fy
-    wrench[4] += arm[2] * fx - arm[0] * fz
-    wrench[5] += arm[0] * fy - arm[1] * fx
+    wrench[3] += arm_y * fz - arm_z * fy
+    wrench[4] += arm_z * fx - arm_x * fz
+    wrench[5] += arm_x * fy - arm_y * fx

@@ -39,8 +39,8 @@ bodies that take part in it."""
 class ContactPhysics:
     """Contact physics of one world; `start` begins an episode."""
 
-    def __init__(self, road: Road, car: CarParameters) -> None:
-        self.walls = Walls(road)
+    def __init__(self, road: Road, car: CarParameters, walls: Walls) -> None:
+        self.walls = walls
         self._client: PhysicsClient | None = None
         self._table, self._ground = road.track.arrays(), ground(road)
         self._car = car

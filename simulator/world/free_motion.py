@@ -12,8 +12,9 @@ from runtime.jit import compiled
 from simulator.arrays import FloatArray
 from simulator.track.piece_table import Table, locate
 from simulator.traffic.wreck import lane_motion
-from simulator.vehicle.dynamics import DT, MOTION, PIECE, compute_forces
-from simulator.vehicle.rigid_body import integrate
+from simulator.vehicle.dynamics import DT, MOTION, PIECE, Work, compute_forces_at, forget_turn
+from simulator.vehicle.orientation import fill_axes
+from simulator.vehicle.rigid_body import integrate_with
 from simulator.vehicle.surface import Ground
 from simulator.world.boxes import BOX, box_radius, boxes_overlap, fill_car_box
 from simulator.world.walls import WallTable, fill_panel_box
@@ -40,7 +41,30 @@ def touches(
     change over it; share: fraction of the control step already done.
     """
     radius = box_radius(params[0]) + margin
-    _, s, d = locate(table, motion[0], motion[1], piece)
+    at = locate(table, motion[0], motion[1], piece)
+    return touches_at(
+        params, other, table, walls, motion, at, others, move, share, dt, margin, radius
+    )
+
+
+@compiled
+def touches_at(
+    params: NDArray[Any],
+    other: NDArray[Any],
+    table: Table,
+    walls: WallTable,
+    motion: FloatArray,
+    at: tuple[int, float, float],
+    others: FloatArray,
+    move: FloatArray,
+    share: float,
+    dt: float,
+    margin: float,
+    radius: float,
+) -> bool:
+    """`touches` of a car whose place `at` (see `locate`) is at hand; radius: of its box, plus the
+    margin."""
+    _, s, d = at
     beside_wall = abs(d) > walls[0] - radius
     if not beside_wall and others.shape[0] == 0:
         return False
@@ -80,21 +104,27 @@ def advance_free(
     done: int,
     steps: int,
     margin: float,
+    work: Work,
 ) -> int:
     """Advance the ego car from physics step `done` of `steps` until it touches something.
 
     `margin` (m) as in `touches` applies before the first of these steps, and 0 afterwards. Returns
-    the number of steps then done.
+    the number of steps then done. `work` is memory for the steps.
     """
-    wrench = np.empty(6)
+    p, axes, wrench = params[0], work[0], work[5]
+    forget_turn(work)
+    own_radius = box_radius(p)
     while done < steps:
-        share, piece = done / steps, int(memory[PIECE])
-        if touches(
-            params, other, table, walls, motion, piece, others, move, share, steps * DT, margin
+        share, dt, radius = done / steps, steps * DT, own_radius + margin
+        at = locate(table, motion[0], motion[1], int(memory[PIECE]))
+        beside_wall = abs(at[2]) > walls[0] - radius
+        if (beside_wall or others.shape[0]) and touches_at(
+            params, other, table, walls, motion, at, others, move, share, dt, margin, radius
         ):
             return done
-        compute_forces(params, table, ground, motion, memory, command, wrench)
-        integrate(params[0], motion, wrench)
+        fill_axes(motion[3:7], axes)
+        compute_forces_at(p, table, ground, at, motion, memory, command, work)
+        integrate_with(p, axes, motion, wrench)
         margin = 0.0
         done += 1
     return done

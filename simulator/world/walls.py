@@ -107,8 +107,10 @@ def fill_panel_box(
     if not panel_beside(table, walls, s, to_middle, reach, row):
         return False
     cos, sin = math.cos(row[3]), math.sin(row[3])
-    box[:] = 0.0
-    box[CENTRE : CENTRE + 3] = row[:3]
+    for i in range(box.shape[0]):
+        box[i] = 0.0
+    for i in range(3):
+        box[CENTRE + i] = row[i]
     box[AXES], box[AXES + 1] = cos, sin
     box[AXES + 3], box[AXES + 4] = -sin, cos
     box[AXES + 8] = 1.0

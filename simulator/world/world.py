@@ -18,10 +18,19 @@ from simulator.track.road import START_BEFORE_LINE_M, Road
 from simulator.traffic.traffic import Traffic
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import HIGHEST_GEAR, LOWEST_GEAR, RPM, CarParameters
-from simulator.vehicle.dynamics import ENGINE, MEMORY, MOTION, ODOMETER, PIECE, SPIN, STEER
+from simulator.vehicle.dynamics import (
+    ENGINE,
+    MEMORY,
+    MOTION,
+    ODOMETER,
+    PIECE,
+    SPIN,
+    STEER,
+    make_work,
+)
 from simulator.vehicle.orientation import quaternion
 from simulator.vehicle.powertrain import gear_ratio
-from simulator.vehicle.state import CarState, Collision, Command
+from simulator.vehicle.state import CarState, Command
 from simulator.vehicle.surface import ground
 from simulator.vehicle.track_state import (
     ANGLE,
@@ -31,15 +40,29 @@ from simulator.vehicle.track_state import (
     TRACK_OFFSET,
     TRACK_S,
     TRACK_SPEED,
-    TRACK_STATE_SIZE,
     VX,
     VY,
     YAW,
     YAW_RATE,
-    measure_track_state,
 )
 from simulator.world.collisions import CONTACT_MARGIN_M, ContactPhysics
 from simulator.world.control_rate import PHYSICS_HZ, check_frequency
+from simulator.world.control_step import advance_cars, measure_car
+from simulator.world.fleet import (
+    COLLISIONS,
+    COMMAND_AT,
+    DONE,
+    IN_CONTACT,
+    LAP,
+    LAP_START,
+    MEMORY_AT,
+    MOTION_AT,
+    SKIPPED,
+    STEPS,
+    TOUCHED,
+    TRACK_AT,
+    Fleet,
+)
 from simulator.world.free_motion import advance_free
 from trackfeatures.errors import UserError
 
@@ -48,11 +71,14 @@ __all__ = ["CarState", "Command", "World"]
 BACKWARDS_SPEED_M_S = -0.5
 """Below this speed along the track, the car drives backwards."""
 MAX_START_SPEED_M_S = 150.0
-NO_TRAFFIC = np.zeros((0, 6))
 
 
 class World:
-    """One episode at a time; `reset` starts one, `step` holds a command for 1/frequency_hz s."""
+    """One episode at a time; `reset` starts one, `step` holds a command for 1/frequency_hz s.
+
+    The ego car is car `number` of `fleet`, by default of a fleet of its own. Whoever steps a whole
+    fleet calls `begin`, the compiled step, and `complete`; `step` does the same for one car.
+    """
 
     def __init__(
         self,
@@ -61,6 +87,8 @@ class World:
         traffic: int = 0,
         frequency_hz: int = 20,
         car: CarParameters | None = None,
+        fleet: Fleet | None = None,
+        number: int = 0,
     ) -> None:
         check_frequency(frequency_hz)
         self.road = road
@@ -71,19 +99,25 @@ class World:
         self._params, self._other = self.car.packed(), TRAFFIC_CAR.packed()
         self._table = road.track.arrays()
         self._ground = ground(road)
-        self._motion = np.zeros(MOTION)
-        self._memory = np.zeros(MEMORY)
-        self._readings = np.zeros(TRACK_STATE_SIZE)
-        self._controls = np.zeros(4)
-        self._contacts = ContactPhysics(road, self.car)
+        self._fleet, self._number = fleet or Fleet(1), number
+        walls = self._fleet.assign(number, road, self.car, traffic)
+        self._row = self._fleet.cars[number]
+        self._motion = self._row[MOTION_AT : MOTION_AT + MOTION]
+        self._memory = self._row[MEMORY_AT : MEMORY_AT + MEMORY]
+        self._controls = self._row[COMMAND_AT : COMMAND_AT + 4]
+        self._work = make_work()
+        self._contacts = ContactPhysics(road, self.car, walls)
         self._state: CarState | None = None
-        self._closed = False
+        self._state_step = 0.0
+        self._started = self._closed = False
 
     @property
     def state(self) -> CarState:
         """The current state of the ego car. Raises UserError before the first reset."""
-        if self._state is None:
+        if not self._started:
             raise UserError("the world has no episode yet; call reset(seed=...) first")
+        if self._state is None or self._state_step != self._row[STEPS]:
+            self._state, self._state_step = self._build_state(), float(self._row[STEPS])
         return self._state
 
     def reset(
@@ -115,25 +149,44 @@ class World:
                 f"reset got to_middle = {to_middle} m; the road ends {self.road.edge:.2f} m from "
                 "its centre, so give less"
             )
-        self.traffic = Traffic(
-            self.road, self._traffic_count, np.random.default_rng([seed, 1]), ego_s=start
-        )
+        if self._traffic_count:
+            self.traffic = Traffic(
+                self.road, self._traffic_count, np.random.default_rng([seed, 1]), ego_s=start
+            )
         self._contacts.start(self.traffic)
-        self._in_contact = False
         self._place(start, to_middle, angle, speed)
-        self._lap, self._steps, self._lap_start = 0, 0, 0
-        self._s = float(start % self.road.track.length_m)
-        self._state = self._build_state(1, None)
-        return self._state
+        self._row[[STEPS, LAP, LAP_START, TOUCHED, IN_CONTACT]] = 0.0
+        self._controls[:] = 0.0, 0.0, 0.0, 1.0
+        self._row[TRACK_AT + TRACK_S] = start % self.road.track.length_m
+        measure_car(self._table, self._row)
+        self._state, self._started = None, True
+        return self.state
 
     def step(self, command: Command) -> CarState:
         """Hold `command` for one control step; raises UserError for a value out of its range."""
-        before = self.state
+        if not self._started:
+            return self.state  # raises
         _fill_controls(command, self._controls)
-        collision = self._advance_car(*self._advance_traffic(before))
-        self._steps += 1
-        self._state = self._build_state(command.gear, collision)
-        return self._state
+        self.begin()
+        number, steps = self._number, PHYSICS_HZ // self.frequency_hz
+        advance_cars(number, number + 1, self._fleet.arrays, steps)
+        if self._row[DONE] < steps:
+            self.complete()
+        return self.state
+
+    def begin(self) -> None:
+        """Begin a control step: move the traffic; leave a car among moving wrecks to PyBullet."""
+        self._row[TOUCHED] = self._row[DONE] = self._row[SKIPPED] = 0.0
+        if self._traffic_count:
+            self._advance_traffic(self.state)
+            self._row[SKIPPED] = self._contacts.has_moving_wrecks
+
+    def complete(self) -> None:
+        """Complete a control step that the compiled code left incomplete, because the car touches
+        something or drives among moving wrecks."""
+        self._advance_in_contact()
+        self._row[STEPS] += 1.0
+        measure_car(self._table, self._row)
 
     def features(self) -> tf.TrackFeatures:
         """The true track features of the present moment.
@@ -153,7 +206,7 @@ class World:
     def close(self) -> None:
         """Release the physics client; afterwards `reset` and `step` raise UserError."""
         self._contacts.close()
-        self._state, self._closed = None, True
+        self._state, self._started, self._closed = None, False, True
 
     def __enter__(self) -> Self:
         return self
@@ -184,38 +237,38 @@ class World:
         turning = abs(speed) / self.car.wheel_radius * gear_ratio(self._params[0], 1)
         self._memory[ENGINE] = max(turning, self.car.idle_rpm / RPM)
 
-    def _advance_traffic(self, before: CarState) -> tuple[FloatArray, FloatArray]:
-        """Advance the traffic by one control step; returns its poses (n, 6) before the step and
-        their change over it (n, 6)."""
-        if not self.traffic.count:
-            return NO_TRAFFIC, NO_TRAFFIC
+    def _advance_traffic(self, before: CarState) -> None:
+        """Advance the traffic by one control step, and write its poses (n, 6) before the step and
+        their change over it (n, 6) into the fleet."""
         old = self.traffic.poses()
         self.traffic.step(1.0 / self.frequency_hz, before.s, before.to_middle, before.speed)
         move = self.traffic.poses() - old
         move[:, 3:] = (move[:, 3:] + math.pi) % (2.0 * math.pi) - math.pi
-        return old, move
+        self._fleet.others[self._number, : len(old)] = old
+        self._fleet.move[self._number, : len(old)] = move
 
-    def _advance_car(self, others: FloatArray, move: FloatArray) -> Collision | None:
-        """Advance the ego car by one control step while the traffic moves from `others` by `move`
-        ((n, 6) each); returns what the ego car touched first."""
-        steps, done = PHYSICS_HZ // self.frequency_hz, 0
-        collision: Collision | None = None
+    def _advance_in_contact(self) -> None:
+        """Do the rest of a control step: PyBullet computes contacts, compiled code the motion
+        between them. Stores what the car touched first."""
+        steps, done = PHYSICS_HZ // self.frequency_hz, int(self._row[DONE])
+        others = self._fleet.others[self._number, : self._traffic_count]
+        move = self._fleet.move[self._number, : self._traffic_count]
         while done < steps:
+            share, dt = done / steps, 1.0 / self.frequency_hz
+            touched = self._contacts.step(
+                self._motion, self._memory, self._controls, others, move, share, dt
+            )
+            self._row[TOUCHED] = self._row[TOUCHED] or COLLISIONS.index(touched)
+            self._row[IN_CONTACT], done = 1.0, done + 1
             if not self._contacts.has_moving_wrecks:
                 before, done = done, self._advance_free(others, move, done, steps)
-                self._in_contact = self._in_contact and done == before
-            if done < steps:
-                share, dt = done / steps, 1.0 / self.frequency_hz
-                touched = self._contacts.step(
-                    self._motion, self._memory, self._controls, others, move, share, dt
-                )
-                collision, done = collision or touched, done + 1
-                self._in_contact = True
-        return collision
+                self._row[IN_CONTACT] = done == before
+        self._row[DONE] = done
 
     def _advance_free(self, others: FloatArray, move: FloatArray, done: int, steps: int) -> int:
-        """Advance from physics step `done` until the car touches something; returns the number of
-        physics steps then done. A contact ends when the gap exceeds PyBullet's threshold."""
+        """Advance from physics step `done`, in contact, until the car touches something; returns
+        the number of physics steps then done. A contact ends when the gap exceeds PyBullet's
+        threshold."""
         return advance_free(
             self._params,
             self._other,
@@ -229,53 +282,40 @@ class World:
             move,
             done,
             steps,
-            CONTACT_MARGIN_M if self._in_contact else 0.0,
+            CONTACT_MARGIN_M,
+            self._work,
         )
 
-    def _build_state(self, gear: int, collision: Collision | None) -> CarState:
-        """The state of the ego car, from its motion and internal state."""
-        measure_track_state(self._table, self._motion, self._memory, self._readings)
-        motion, memory = self._motion.tolist(), self._memory.tolist()
-        readings = self._readings.tolist()
-        self._count_laps(readings[TRACK_S])
+    def _build_state(self) -> CarState:
+        """The state of the ego car, from its row."""
+        row = self._row.tolist()
+        motion, memory, track = row[MOTION_AT:], row[MEMORY_AT:], row[TRACK_AT:]
         return CarState(
-            time_s=self._steps / self.frequency_hz,
+            time_s=int(row[STEPS]) / self.frequency_hz,
             x=motion[0],
             y=motion[1],
             z=motion[2],
-            yaw=readings[YAW],
-            pitch=readings[PITCH],
-            roll=readings[ROLL],
-            vx=readings[VX],
-            vy=readings[VY],
-            yaw_rate=readings[YAW_RATE],
-            s=readings[TRACK_S],
-            to_middle=readings[TRACK_OFFSET],
-            angle=readings[ANGLE],
-            curvature=readings[TRACK_CURVATURE],
+            yaw=track[YAW],
+            pitch=track[PITCH],
+            roll=track[ROLL],
+            vx=track[VX],
+            vy=track[VY],
+            yaw_rate=track[YAW_RATE],
+            s=track[TRACK_S],
+            to_middle=track[TRACK_OFFSET],
+            angle=track[ANGLE],
+            curvature=track[TRACK_CURVATURE],
             rpm=memory[ENGINE] * RPM,
-            gear=gear,
+            gear=int(row[COMMAND_AT + 3]),
             wheel_spin=(memory[SPIN], memory[SPIN + 1], memory[SPIN + 2], memory[SPIN + 3]),
             steer=memory[STEER] / self.car.steering_lock,
-            lap=self._lap,
+            lap=int(row[LAP]),
             odometer_m=memory[ODOMETER],
-            lap_time_s=(self._steps - self._lap_start) / self.frequency_hz,
-            collision=collision,
-            off_track=abs(readings[TRACK_OFFSET]) > self.road.edge,
-            backwards=abs(readings[ANGLE]) > 0.5 * math.pi
-            or readings[TRACK_SPEED] < BACKWARDS_SPEED_M_S,
+            lap_time_s=int(row[STEPS] - row[LAP_START]) / self.frequency_hz,
+            collision=COLLISIONS[int(row[TOUCHED])],
+            off_track=abs(track[TRACK_OFFSET]) > self.road.edge,
+            backwards=abs(track[ANGLE]) > 0.5 * math.pi or track[TRACK_SPEED] < BACKWARDS_SPEED_M_S,
         )
-
-    def _count_laps(self, s: float) -> None:
-        """Crossing the line adds a lap; crossing it backwards subtracts one."""
-        length = self.road.track.length_m
-        moved = s - self._s
-        if moved < -0.5 * length:
-            self._lap += 1
-            self._lap_start = self._steps
-        elif moved > 0.5 * length:
-            self._lap -= 1
-        self._s = s
 
 
 def check_seed(seed: int) -> None:

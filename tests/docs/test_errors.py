@@ -39,6 +39,7 @@ from runtime.camera_file import read_camera
 from serve.cameras import read_cameras
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.turns import Turns
+from simulator.env.vector import LateralControlVector
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.track.torcs.torcs import read_torcs
@@ -313,6 +314,18 @@ def _(folder: Path) -> object:
     turns = Turns(mock.Mock(), (1, 2, 2, 3), free=lambda: None)
     with mock.patch("os.getpid", return_value=0), turns:  # as a forked child finds it
         return None
+
+
+@row("a bad action of one of many cars")
+def _(folder: Path) -> object:
+    cars = LateralControlVector(2, track="oval")
+    cars.reset(seed=0)
+    return cars.step([[0.0], [float("nan")]])
+
+
+@row("a list with more or fewer entries than a vector has cars")
+def _(folder: Path) -> object:
+    return LateralControlVector(3, track=["oval", "town"])
 
 
 @row("EGL is missing")

@@ -105,3 +105,11 @@ def test_a_user_without_a_home_folder_gets_a_temporary_folder(
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", fail)
     assert os.access(code_folder("ours", package), os.W_OK)
+
+
+def test_a_change_in_any_of_the_packages_has_another_folder(package: Path) -> None:
+    other = package.parent / "imported"
+    other.mkdir()
+    first = code_folder("ours", package, other)
+    (other / "definitions.py").write_text("b = 1\n")
+    assert code_folder("ours", package, other) != first

@@ -1,0 +1,98 @@
+"""The episodes of one car: each draws its road, car and start from the car's own generator."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from simulator.env.options import DriveOptions, draw
+from simulator.env.start import check_start
+from simulator.track.catalogue import find_track
+from simulator.track.geometry import Track
+from simulator.track.random_roads.road import RANDOM, random_name
+from simulator.track.road import Road
+from simulator.varied.road import make_road
+from simulator.world.fleet import Fleet
+from simulator.world.world import World
+
+RANDOM_ROADS = 256
+"""Number of roads of `track="random"`: making one takes some 30 ms, so that each is made once."""
+
+
+class RoadShop:
+    """Makes each road once, for all cars that drive on it."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[tuple[str, str | Path | None], Track] = {}
+        self._roads: dict[tuple[Any, ...], Road] = {}
+
+    def road(self, options: DriveOptions, track: str, lanes: int, width: float | None) -> Road:
+        place = (track, options.tracks_dir)
+        if place not in self._tracks:
+            folder = None if options.tracks_dir is None else Path(options.tracks_dir)
+            self._tracks[place] = find_track(track, folder)
+        key = (*place, lanes, width, options.roads, options.road_seed)
+        if key not in self._roads:
+            self._roads[key] = make_road(
+                self._tracks[place], lanes, width, options.roads, options.road_seed
+            )
+        return self._roads[key]
+
+
+class Drive:
+    """The world of car `number` of `fleet`; `reset` begins an episode.
+
+    `world` is another object after a reset that drew another road or car.
+    """
+
+    def __init__(self, options: DriveOptions, fleet: Fleet, number: int, roads: RoadShop) -> None:
+        self._options, self._fleet, self._number, self._roads = options, fleet, number, roads
+        self._draws_road = options.track == RANDOM or any(
+            isinstance(value, tuple) for value in (options.lanes, options.lane_width)
+        )
+        self._draws_car = any(
+            isinstance(value, tuple) for value in (options.friction, options.mass)
+        )
+        self.world = self._make_world(None)
+
+    def reset(self, rng: np.random.Generator, given: Mapping[str, Any]) -> int:
+        """Begin an episode that starts at the `given` options of `reset`; returns its seed."""
+        start = self.check(given)
+        episode = int(rng.integers(2**31))
+        if self._draws_road or self._draws_car:
+            self.world.close()
+            self.world = self._make_world(rng)
+        drawn = {name: draw(setting, rng) for name, setting in start.items()}
+        self.world.reset(seed=episode, **check_start(drawn, self.world.road))
+        return episode
+
+    def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The start of an episode with the `given` options of `reset`, before anything is drawn.
+        Raises UserError for an unknown option or a value that is no number."""
+        start = {**self._options.start, **given}
+        check_start({name: draw(value, None) for name, value in start.items()}, self.world.road)
+        return start
+
+    def _make_world(self, rng: np.random.Generator | None) -> World:
+        options = self._options
+        road, car = self._make_road(rng), options.car(rng)
+        return World(
+            road,
+            traffic=options.traffic,
+            frequency_hz=options.frequency_hz,
+            car=car,
+            fleet=self._fleet,
+            number=self._number,
+        )
+
+    def _make_road(self, rng: np.random.Generator | None) -> Road:
+        options, track, lanes = self._options, self._options.track, self._options.lanes
+        if track == RANDOM:
+            track = random_name(0 if rng is None else int(rng.integers(RANDOM_ROADS)))
+        if isinstance(lanes, tuple):
+            lanes = lanes[0] if rng is None else int(rng.integers(lanes[0], lanes[1] + 1))
+        width = draw(options.lane_width, rng)
+        if isinstance(options.lane_width, tuple):
+            width = round(width, 1)
+        return self._roads.road(options, track, lanes, width)

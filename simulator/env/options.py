@@ -1,0 +1,135 @@
+"""The options of the environments: the road, its traffic, the car and the controls."""
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import trackfeatures as tf
+from simulator.env.action import Controls, check_controls
+from simulator.env.observation import ObservationOptions
+from simulator.env.reward import EpisodeOptions
+from simulator.env.start import OPTIONS as START_OPTIONS
+from simulator.env.view_renderer import RenderOptions
+from simulator.vehicle.car import CarParameters
+from trackfeatures.errors import UserError
+
+Setting = float | tuple[float, float]
+"""A number, or the range (least, greatest) from which each episode draws one."""
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """The road, its traffic, the car and the controls. Raises UserError for a bad option."""
+
+    track: str = "circuit"
+    """A name, a file, or "random": each episode drives on one of 256 random roads."""
+
+    lanes: int | tuple[int, int] = 1
+    lane_width: Setting | None = None
+    """m; a number drawn from a range is rounded to 0.1 m. None: 4.0, or the width drawn for a
+    varied road."""
+    roads: str = "paper"
+    """"varied": lane width, shoulders and lines are drawn from `road_seed`, the look from
+    `light_seed`."""
+    road_seed: int = 0
+    traffic: int = 0
+    """Other cars, 0 to 12."""
+
+    friction: Setting = 1.0
+    """Factor on the tyres' friction coefficient."""
+    mass: Setting = 1.0
+    """Factor on the car's mass, without fuel, and on its inertia."""
+    start: Mapping[str, Setting] = field(default_factory=dict)
+    """Start of each episode, as in `reset(options=...)`, which has priority."""
+
+    frequency_hz: int = 20
+    """Control steps per second; must divide the physics' 200 Hz."""
+
+    controls: Controls = "steer"
+    """"steer": steering only, at throttle 0.2 in gear 1; "full": steering, throttle, brake and
+    gear."""
+
+    tracks_dir: str | Path | None = None
+    """A further folder to search for tracks."""
+
+    def __post_init__(self) -> None:
+        check_controls(self.controls)
+        for name in ("friction", "mass"):
+            for value in _ends(name, getattr(self, name)):
+                if not value > 0.0:
+                    raise UserError(f"{name} is {value:g}; give a factor above 0")
+        if isinstance(self.lanes, tuple):
+            for lanes in _ends("lanes", self.lanes):
+                tf.check_lanes(int(lanes), tf.LANE_WIDTH_M)
+        if isinstance(self.lane_width, tuple):
+            for width in _ends("lane_width", self.lane_width):
+                tf.check_lanes(1, width)
+        for name, setting in self.start.items():
+            if name not in START_OPTIONS:
+                raise UserError(f"start has {name!r}; it takes {', '.join(START_OPTIONS)}")
+            _ends(name, setting)
+
+    def car(self, rng: np.random.Generator | None) -> CarParameters:
+        """The car of an episode; `rng` draws from ranges, None takes their least values."""
+        friction, mass = draw(self.friction, rng), draw(self.mass, rng)
+        car = CarParameters()
+        if friction == mass == 1.0:
+            return car
+        x, y, z = car.inertia
+        return replace(
+            car,
+            friction=car.friction * friction,
+            mass=car.mass * mass,
+            inertia=(x * mass, y * mass, z * mass),
+        )
+
+
+OPTIONS = (DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions)
+
+
+def split_options(
+    given: dict[str, Any],
+) -> tuple[DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions]:
+    """The four groups of options from keyword arguments. Raises UserError for an unknown one."""
+    names = [field.name for group in OPTIONS for field in fields(group)]
+    for name in given:
+        if name not in names:
+            close = difflib.get_close_matches(name, names, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"it takes {', '.join(names)}"
+            raise UserError(f"the environment has no option {name!r}; {hint}")
+    drive, episode, observation, picture = (
+        {field.name: given[field.name] for field in fields(group) if field.name in given}
+        for group in OPTIONS
+    )
+    return (
+        DriveOptions(**drive),
+        EpisodeOptions(**episode),
+        ObservationOptions(**observation),
+        RenderOptions(**picture),
+    )
+
+
+def draw(setting: Any, rng: np.random.Generator | None) -> Any:
+    """The number of a setting: itself, or one drawn from its range, the least without `rng`."""
+    if not isinstance(setting, tuple):
+        return setting
+    return setting[0] if rng is None else float(rng.uniform(*setting))
+
+
+def _ends(name: str, setting: Any) -> tuple[float, ...]:
+    """The number of a setting, or both ends of its range. Raises UserError for anything else."""
+    given = setting if isinstance(setting, tuple) else (setting, setting)
+    try:
+        ends = tuple(float(value) for value in given)
+    except (TypeError, ValueError):
+        ends = ()
+    if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] > ends[1]:
+        raise UserError(
+            f"{name} is {setting!r}; give a finite number, or a range (least, greatest)"
+        )
+    return ends

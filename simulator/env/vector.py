@@ -1,0 +1,314 @@
+"""Many cars in one vector environment: `gymnasium.make_vec` with "vector_entry_point".
+
+    envs = gymnasium.make_vec(
+        "driverview/LateralControl-v0", num_envs=256, vectorization_mode="vector_entry_point",
+        track="random", friction=(0.8, 1.2), start={"s": (0.0, 1000.0)},
+    )
+
+Each car has the same numbers, bit for bit, as one environment with the car's options and seed.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from numpy.typing import NDArray
+
+from simulator import MAX_STEPS
+from simulator.env.action import action_space, naming_car, to_rows
+from simulator.env.cars import Cars
+from simulator.env.control_step import ENDED, REWARD
+from simulator.env.errors import NotCopyable, ResetNeeded
+from simulator.env.observation import STATE, Kind, Observer, read_from_beams
+from simulator.env.options import DriveOptions, split_options
+from simulator.env.vector_info import vector_info
+from simulator.env.view_renderer import ViewRenderer
+from simulator.world.fleet import COMMAND_AT, STEPS
+from simulator.world.world import World
+from trackfeatures.errors import UserError
+
+PER_CAR = (
+    *("track", "lanes", "lane_width", "roads", "road_seed"),
+    *("traffic", "friction", "mass", "start"),
+)
+"""Options that may be lists with one entry for each car."""
+CARS_PER_THREAD = 32
+"""Least number of cars for which a thread of their own saves time."""
+MASK = "reset_mask"
+
+
+class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
+    """`num_envs` cars, each as in an environment `LateralControl` of its own.
+
+    The options are those of `LateralControl`. Each option of PER_CAR, and each number of `start`,
+    is one value for all cars or a list with one entry for each car. An entry that is a tuple
+    (least, greatest) is a range, from which each episode draws a number. `threads`: at most this
+    many threads step the cars; None: one for each core, but at least 32 cars a thread.
+
+    Raises UserError for bad options and actions; its message names the car, and no car has moved.
+    """
+
+    kind: ClassVar[Kind] = "state"
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        track: str | Sequence[str] = "circuit",
+        lanes: int | tuple[int, int] | Sequence[int | tuple[int, int]] = 1,
+        *,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = MAX_STEPS,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int | None = None,
+        **options: Any,
+    ) -> None:
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise UserError(f"num_envs is {num_envs!r}; give a whole number of 1 or more")
+        if threads is not None and (not isinstance(threads, int) or threads < 1):
+            raise UserError(f"threads is {threads!r}; give a whole number of 1 or more, or None")
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
+        given = {"track": track, "lanes": lanes} | options
+        listed, own = _lists({name: given[name] for name in PER_CAR if name in given}, num_envs)
+        shared = {name: value for name, value in given.items() if name not in PER_CAR} | own
+        if isinstance(shared.get("start"), Mapping):
+            starts, start = _lists(dict(shared["start"]), num_envs)
+            if starts:
+                listed["start"] = [start | own for own in _of_each_car(starts, num_envs)]
+                del shared["start"]
+        drive, episode, observation, picture = split_options(shared)
+        observation = observation.resolved(self.kind)
+        self._cars = Cars(
+            _drives(drive, listed, num_envs),
+            episode,
+            noise=observation.state_noise,
+            limit=observation.limit,
+            beams=any(map(read_from_beams, observation.sensors)),
+            threads=threads or _default_threads(num_envs),
+        )
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self._renderers = [
+            ViewRenderer(self.world(number).road, picture) for number in range(num_envs)
+        ]
+        self._render_view = picture.render_view
+        self._observers = [
+            Observer(observation, renderer, self._cars.beams_of(number))
+            for number, renderer in enumerate(self._renderers)
+        ]
+        self._frequency_hz, self._controls = drive.frequency_hz, drive.controls
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": drive.frequency_hz,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_action_space = action_space(drive.controls)
+        self.single_observation_space = self._observers[0].space
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._rngs: list[np.random.Generator] = []
+        self._max_steps = max_episode_steps or np.inf
+        self._over = np.zeros(num_envs, np.bool_)
+        self._observed: list[Any] = [None] * num_envs
+
+    def world(self, number: int) -> World:
+        """The world of the present episode of a car."""
+        return self._cars.world(number)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode of each car, or of those of `options["reset_mask"]` (N,) bool. The other
+        options are those of a single environment; each is a number, a list with one for each car,
+        or a range (least, greatest)."""
+        given = dict(options or {})
+        chosen = self._mask(given.pop(MASK, None))
+        seeds = self._seeds(seed)
+        starts = self._starts(given)
+        for number in np.flatnonzero(chosen).tolist():
+            with naming_car(number, self.num_envs):
+                self._cars.drives[number].check(starts[number])
+        if not self._rngs:
+            self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
+        for number in np.flatnonzero(chosen).tolist():
+            if seeds[number] is not None:
+                self._rngs[number] = seeding.np_random(seeds[number])[0]
+            self._reset(number, starts[number])
+        self._over[chosen] = False
+        return self._observe(chosen), self._info(chosen)
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Advance all cars by a control step; those whose episode is over are reset as the
+        autoreset mode says."""
+        self._check_running()
+        moving = ~self._over
+        rows = to_rows(actions, self._controls, moving)
+        for number in np.flatnonzero(self._over).tolist():
+            self._reset(number, {})
+        cars = self._cars
+        cars.fleet.cars[moving, COMMAND_AT : COMMAND_AT + 4] = rows[moving]
+        cars.step(self._rngs, moving)
+        rewards = cars.results[:, REWARD].copy()
+        terminated = cars.results[:, ENDED] > 0.0
+        truncated = moving & (cars.fleet.cars[:, STEPS] >= self._max_steps)
+        self._over = terminated | truncated
+        observed = self._observe(np.ones(self.num_envs, np.bool_))
+        everyone = np.ones(self.num_envs, np.bool_)
+        if self.autoreset_mode != AutoresetMode.SAME_STEP or not self._over.any():
+            return observed, rewards, terminated, truncated, self._info(everyone)
+        last = self._last(observed)
+        for number in np.flatnonzero(self._over).tolist():
+            self._reset(number, {})
+        observed = self._observe(self._over)
+        self._over = np.zeros(self.num_envs, np.bool_)
+        return observed, rewards, terminated, truncated, self._info(everyone) | last
+
+    def render(self) -> tuple[Any, ...]:
+        """`render_view` (H, W, 3) of each car with `render_mode="rgb_array"`, else Nones."""
+        if self.render_mode is None:
+            return (None,) * self.num_envs
+        view = self._render_view
+        return tuple(
+            renderer.render(self.world(number), (view,))[view]
+            for number, renderer in enumerate(self._renderers)
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self._rngs = []
+        for renderer in self._renderers:
+            renderer.close()
+        self._cars.close()
+
+    def __getstate__(self) -> Any:
+        raise NotCopyable(
+            "an environment cannot be copied or pickled; make another one with the same options, "
+            "or pass a function that makes it"
+        )
+
+    def _reset(self, number: int, start: Mapping[str, Any]) -> None:
+        with naming_car(number, self.num_envs):
+            episode = self._cars.reset(number, self._rngs[number], start)
+        self._observers[number].restart(episode)
+        self._renderers[number].change_road(self.world(number).road)
+
+    def _observe(self, chosen: NDArray[np.bool_]) -> Any:
+        """The observations of all cars; those of the `chosen` ones are new."""
+        batched = self._observers[0].batched
+        if batched and not isinstance(self.single_observation_space, gym.spaces.Dict):
+            return self._cars.states.copy()
+        if batched:
+            parts: dict[str, NDArray[Any]] = {STATE: self._cars.states.copy()}
+            for sensor in self._observers[0].suite.sensors:
+                parts[sensor.name] = sensor.limit(self._cars.beams).astype(sensor.dtype)
+            return parts
+        for number in np.flatnonzero(chosen).tolist():
+            state = self._cars.states[number].copy()
+            self._observed[number] = self._observers[number].observe(self.world(number), state)
+        space = self.single_observation_space
+        empty: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, self._observed, empty)
+
+    def _info(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
+        return vector_info(self._cars, self._frequency_hz, chosen)
+
+    def _last(self, observed: Any) -> dict[str, Any]:
+        """What Gymnasium's same-step mode adds to `info` for the cars whose episode is over."""
+        observations = np.full(self.num_envs, None, object)
+        for number in np.flatnonzero(self._over).tolist():
+            observations[number] = (
+                {name: part[number].copy() for name, part in observed.items()}
+                if isinstance(observed, dict)
+                else observed[number].copy()
+            )
+        over = self._over.copy()
+        return {
+            "final_obs": observations,
+            "_final_obs": over,
+            "final_info": self._info(over),
+            "_final_info": over,
+        }
+
+    def _check_running(self) -> None:
+        if not self._rngs:
+            raise ResetNeeded("there are no episodes to step in; call reset() first")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._over.any():
+            cars = ", ".join(map(str, np.flatnonzero(self._over)))
+            raise ResetNeeded(
+                f'the episodes of cars {cars} are over; call reset(options={{"reset_mask": ...}}), '
+                "or choose another autoreset_mode"
+            )
+
+    def _mask(self, mask: Any) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        found = np.asarray(mask)
+        if found.shape != (self.num_envs,) or found.dtype != np.bool_ or not found.any():
+            raise UserError(
+                f"reset_mask has shape {found.shape} and type {found.dtype}; give an array of "
+                f"{self.num_envs} truth values, at least one of them True"
+            )
+        if not self._rngs and not found.all():
+            raise ResetNeeded("the first reset must reset all cars; leave reset_mask out")
+        return found
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + number for number in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise UserError(
+                f"seed is a list of {len(seed)} for {self.num_envs} cars; give one for each, or "
+                "one whole number"
+            )
+        return list(seed)
+
+    def _starts(self, given: dict[str, Any]) -> list[dict[str, Any]]:
+        listed, shared = _lists(given, self.num_envs)
+        return [shared | own for own in _of_each_car(listed, self.num_envs)]
+
+
+def _drives(drive: DriveOptions, listed: dict[str, list[Any]], count: int) -> list[DriveOptions]:
+    """The options of each car."""
+    drives = []
+    for number, own in enumerate(_of_each_car(listed, count)):
+        with naming_car(number, count):
+            drives.append(replace(drive, **own) if own else drive)
+    return drives
+
+
+def _of_each_car(listed: dict[str, list[Any]], count: int) -> list[dict[str, Any]]:
+    return [{name: values[k] for name, values in listed.items()} for k in range(count)]
+
+
+def _lists(given: dict[str, Any], count: int) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+    """The entries of `given` that are lists with one value for each car, and the others."""
+    listed, shared = {}, {}
+    for name, value in given.items():
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        if not isinstance(value, list):
+            shared[name] = value
+            continue
+        if len(value) != count:
+            raise UserError(
+                f"{name} is a list of {len(value)} for {count} cars; give one entry for each car, "
+                "or one value for all"
+            )
+        listed[name] = value
+    return listed, shared
+
+
+def _default_threads(count: int) -> int:
+    return max(1, min(len(os.sched_getaffinity(0)), count // CARS_PER_THREAD))
