@@ -1,17 +1,20 @@
 """The model that ships with the project: its files, and its errors on a track it has never seen."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mtlnet.inference.engine import load_engine
+from mtlnet.inference.engine import INT8, int8_graph, load_engine, read_export
 from mtlnet.inference.model_card import SHIPPED, SHIPPED_FILES, ModelError, read_card, resolve_run
 from runtime.files import file_hash
+from runtime.processor import has_int8
 from tests.typed import typed
 
-MAX_BYTES = 18_000_000
+MAX_BYTES = 20_000_000
+"""Weights in float16, the uncertainty head, a picture, and the int8 graph of 7 MB."""
 
 
 def command(*arguments: str) -> Any:
@@ -26,16 +29,29 @@ def test_the_default_model_is_the_shipped_one_with_the_hashes_in_the_code() -> N
     card = read_card(SHIPPED)
     assert card.files == SHIPPED_FILES
     assert {name: file_hash(SHIPPED / name) for name in SHIPPED_FILES} == SHIPPED_FILES
-    assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < MAX_BYTES
+    files = [path for path in SHIPPED.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < MAX_BYTES
     assert "/" not in card.data["path"]
     assert card.model_hash in (SHIPPED / "README.md").read_text()
+
+
+def test_the_shipped_int8_graph_passed_its_gate_and_is_used() -> None:
+    card, about = read_card(SHIPPED), read_export(SHIPPED / INT8)
+    assert about is not None
+    assert about["model_hash"] == card.model_hash
+    assert about["gate"]["passed"]
+    assert about["gate"]["split"] == "test"
+    assert about["gate"]["frames"] >= 12_000
+    assert max(about["gate"]["worse"].values()) < 0.001
+    graph = int8_graph(SHIPPED, card)  # its hashes
+    assert graph.is_file()
+    assert (load_engine(SHIPPED).precision == "int8") is has_int8()
 
 
 def test_other_weights_in_the_place_of_the_shipped_ones_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for path in SHIPPED.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
     monkeypatch.setattr("mtlnet.inference.model_card.SHIPPED", tmp_path)
     assert load_engine(resolve_run("default")).card == read_card(SHIPPED)
     card = json.loads((tmp_path / "card.json").read_text())
