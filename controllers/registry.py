@@ -65,12 +65,12 @@ CONTROLLERS: dict[str, ControllerEntry] = {
         "controllers.laws.mpc:make_mpc_preview", "MPC that knows the curvature ahead", _MPC_WEIGHTS
     ),
     "lqr-kalman": ControllerEntry(
-        "controllers.laws.estimated:make_lqr_kalman",
+        "controllers.laws.kalman_control:make_lqr_kalman",
         "LQR on a filtered state, for noisy and late perception",
         _LQR_WEIGHTS | {"wheel_rate": (1e-3, 100.0)},
     ),
     "mpc-kalman": ControllerEntry(
-        "controllers.laws.estimated:make_mpc_kalman",
+        "controllers.laws.kalman_control:make_mpc_kalman",
         "MPC on a filtered state, for noisy and late perception",
         _MPC_WEIGHTS,
     ),
