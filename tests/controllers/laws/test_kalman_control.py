@@ -7,8 +7,8 @@ from controllers.drive.closed_loop import DriveResult
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.run import drive
-from controllers.laws.kalman_control import SmoothWeights, smooth_gain
 from controllers.laws.kalman import CAR
+from controllers.laws.kalman_control import SmoothWeights, smooth_gain
 from controllers.laws.lqr_gains import discrete_gain
 
 STEPS = 900
