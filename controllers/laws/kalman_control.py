@@ -15,7 +15,7 @@ reference.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
@@ -31,31 +31,18 @@ APPROACH_RAD = 0.3
 """Largest heading error at which to return to the line."""
 
 
-@dataclass(frozen=True)
-class SmoothWeights:
-    """Weights of the paper's cost, and of the squared change of the wheel angle in a step."""
-
-    offset: float
-    offset_rate: float
-    heading: float
-    heading_rate: float
-    rho: float
-    wheel_rate: float
-
-    @property
-    def state(self) -> LqrWeights:
-        """The paper's weights."""
-        return LqrWeights(self.offset, self.offset_rate, self.heading, self.heading_rate, self.rho)
-
-
-WEIGHTS = SmoothWeights(10.0, 0.2, 10.0, 0.1, 0.01, 3.0)
-WEIGHTS_UNKNOWN_DELAY = SmoothWeights(1.0, 1.0, 5.0, 1.0, 10.0, 0.3)
+WEIGHTS, WHEEL_RATE = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01), 3.0
+"""The paper's cost, and the weight of the squared change of the wheel angle in a control step."""
+WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0), 0.3
+"""The same until the delay is known."""
 MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 
 
-def make_lqr_kalman(loop: LoopConfig, **weights: float) -> "LqrKalman":
-    """`LqrKalman` for a control loop; `weights` replace fields of its `SmoothWeights`."""
-    return LqrKalman(loop.dt, replace(WEIGHTS, **weights))
+def make_lqr_kalman(
+    loop: LoopConfig, *, wheel_rate: float = WHEEL_RATE, **weights: float
+) -> "LqrKalman":
+    """`LqrKalman` for a control loop; `weights` replace fields of its `LqrWeights`."""
+    return LqrKalman(loop.dt, replace(WEIGHTS, **weights), wheel_rate)
 
 
 def make_mpc_kalman(loop: LoopConfig, **weights: float) -> "MpcKalman":
@@ -66,12 +53,16 @@ def make_mpc_kalman(loop: LoopConfig, **weights: float) -> "MpcKalman":
 class LqrKalman:
     """Linear quadratic regulator on the estimated state at a control step of `dt` s."""
 
-    def __init__(self, dt: float = 0.05, weights: SmoothWeights = WEIGHTS) -> None:
+    def __init__(
+        self, dt: float = 0.05, weights: LqrWeights = WEIGHTS, wheel_rate: float = WHEEL_RATE
+    ) -> None:
         self.estimate = StateEstimate(dt)
         self.wheel_angle = 0.0
         """rad of the front wheels since the last control step."""
-        self._gains = SpeedTable(lambda speed: smooth_gain(weights, speed, dt))
-        self._cautious = SpeedTable(lambda speed: smooth_gain(WEIGHTS_UNKNOWN_DELAY, speed, dt))
+        self._gains = SpeedTable(lambda speed: smooth_gain(weights, wheel_rate, speed, dt))
+        self._cautious = SpeedTable(
+            lambda speed: smooth_gain(WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY, speed, dt)
+        )
         self._steady_bends = SpeedTable(CAR.cornering)
 
     def update(self, observation: Observation) -> float:
@@ -116,7 +107,7 @@ class MpcKalman:
         return self._steer
 
 
-def smooth_gain(weights: SmoothWeights, speed: float, dt: float) -> Matrix:
+def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:
     """K (5,) of change = -K (e1, e1', e2, e2', wheel angle), all from their set points.
 
     The change of the wheel angle, in rad, is that of one control step of `dt` s at `speed` m/s.
@@ -124,10 +115,10 @@ def smooth_gain(weights: SmoothWeights, speed: float, dt: float) -> Matrix:
     A, B = CAR.discretise(speed, dt)
     states = np.block([[A, B], [np.zeros((1, 4)), np.eye(1)]])
     change = np.vstack([B, [[1.0]]])
-    Q = np.diag([*np.diag(weights.state.Q), weights.rho])
+    Q = np.diag([*np.diag(weights.Q), weights.rho])
     # The wheels are held at their new angle: rho (wheel + change)^2 has a mixed term.
     mixed = np.array([[0.0], [0.0], [0.0], [0.0], [weights.rho]])
-    R = np.array([[weights.rho + weights.wheel_rate]])
+    R = np.array([[weights.rho + wheel_rate]])
     P = solve_discrete_are(states, change, Q, R, s=mixed)
     gain: Matrix = np.linalg.solve(R + change.T @ P @ change, change.T @ P @ states + mixed.T)[0]
     return gain

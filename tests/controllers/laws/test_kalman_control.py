@@ -8,8 +8,8 @@ from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.run import drive
 from controllers.laws.kalman import CAR
-from controllers.laws.kalman_control import SmoothWeights, smooth_gain
-from controllers.laws.lqr_gains import discrete_gain
+from controllers.laws.kalman_control import smooth_gain
+from controllers.laws.lqr_gains import LqrWeights, discrete_gain
 
 STEPS = 900
 ESTIMATED = ("lqr-kalman", "mpc-kalman")
@@ -30,9 +30,9 @@ def driven(controller: str, disturbance: str) -> tuple[DriveResult, float]:
 def test_without_weight_on_its_change_the_wheel_angle_is_that_of_the_regulator(
     speed: float,
 ) -> None:
-    weights = SmoothWeights(2.0, 0.2, 2.0, 0.1, 0.01, wheel_rate=0.0)
-    found = smooth_gain(weights, speed, 0.05)
-    np.testing.assert_allclose(found[:4], discrete_gain(CAR, weights.state, speed, 0.05), rtol=1e-6)
+    weights = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
+    found = smooth_gain(weights, 0.0, speed, 0.05)
+    np.testing.assert_allclose(found[:4], discrete_gain(CAR, weights, speed, 0.05), rtol=1e-6)
     assert found[4] == pytest.approx(1.0)  # the old wheel angle is replaced
 
 
