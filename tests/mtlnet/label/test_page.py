@@ -8,13 +8,13 @@ import pytest
 
 from mtlnet.data.labels_file import read_labels
 from mtlnet.label.geometry import marking_pixels
-from tests.mtlnet.label.browser import CHROMIUM, Browser, open_page
+from tests.browser import CHROMIUM, MISSING, Browser, open_browser
 from tests.mtlnet.label.conftest import TRUE, Site
 from trackfeatures.camera import CameraParameters
 
 pytestmark = [
     pytest.mark.extended,
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)"),
+    pytest.mark.skipif(CHROMIUM is None, reason=MISSING),
 ]
 VIEW = CameraParameters(width=640, height=360, fov_y_deg=40, x=0.0, z=0.97)
 
@@ -47,7 +47,8 @@ def test_pictures_are_labelled_by_mouse_and_keys(
     site: Site, tmp_path: Path, width: int, height: int
 ) -> None:
     table = site.folder / "labels.csv"
-    with open_page(f"http://127.0.0.1:{site.port}/", tmp_path / "p", width, height) as browser:
+    with open_browser(tmp_path / "p", width, height) as browser:
+        browser.open(f"http://127.0.0.1:{site.port}/")
         browser.wait("document.body.dataset.ready === '0'")
         drag_onto_markings(browser)
         browser.press("Enter")
@@ -76,7 +77,8 @@ def test_pictures_are_labelled_by_mouse_and_keys(
 
 def test_the_page_asks_for_the_token(guarded: Site, tmp_path: Path) -> None:
     url = f"http://127.0.0.1:{guarded.port}/"
-    with open_page(url, tmp_path / "p", 800, 700) as browser:
+    with open_browser(tmp_path / "p", 800, 700) as browser:
+        browser.open(url)
         browser.wait("document.getElementById('locked').hidden === false")
         browser.evaluate(
             "(() => { const t = document.getElementById('token'); "
@@ -84,6 +86,7 @@ def test_the_page_asks_for_the_token(guarded: Site, tmp_path: Path) -> None:
         )
         browser.wait("document.body.dataset.ready === '0'")
         assert browser.evaluate("document.getElementById('locked').hidden") is True
-    with open_page(url + "#a-token-of-sixteen", tmp_path / "q", 800, 700) as browser:
+    with open_browser(tmp_path / "q", 800, 700) as browser:
+        browser.open(url + "#a-token-of-sixteen")
         browser.wait("document.body.dataset.ready === '0'")
         assert browser.evaluate("location.hash") == ""

@@ -15,10 +15,14 @@ import numpy as np
 import pytest
 
 from serve.api.console import FOLDER
-from tests.serve.browser import CHROMIUM, DRIVER, MISSING, Browser, open_browser
+from tests.browser import CHROMIUM, MISSING, Browser, open_browser
 from tests.serve.conftest import Served
 from trackfeatures.camera import CameraParameters
 
+ANSWER = "0.00 m left of the lane's centre, pointing 5.7° to the right."
+"""The sentence of the page for the fake model's answer."""
+PICTURE = "document.getElementById('picture')"
+STATUS = "document.getElementById('status').textContent"
 COUNT = "Number(/over (\\d+)/.exec(document.getElementById('times').textContent)?.[1] ?? 0)"
 """JavaScript expression: the number of requests in the page's latency statistics."""
 
@@ -54,26 +58,26 @@ def test_every_sample_has_the_models_size_and_true_features(service: Served) -> 
         assert service.post(body).status == 200
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with open_browser(tmp_path_factory.mktemp("profile"), 1360, 1000) as found:
+        yield found
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)")
-def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_a_browser_shows_the_answer(service: Served, browser: Browser, tmp_path: Path) -> None:
     """The page sends its first sample without user input."""
-    shot = tmp_path / "console.png"
-    assert CHROMIUM is not None
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--hide-scrollbars", "--dump-dom"]
-    command += ["--window-size=1360,1000", "--virtual-time-budget=10000", f"--screenshot={shot}"]
-    done = subprocess.run(
-        [*command, f"--user-data-dir={tmp_path}", service.url],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    text = " ".join(re.sub(r"<[^>]*>", " ", done.stdout).split())
-    assert "0.00 m left of the lane's centre, pointing 5.7° to the right." in text
-    assert "ml -2.00 m" in text
-    assert "mr 2.00 m" in text
-    assert "straight 50 %" in text
+    browser.open(service.url)
+    browser.wait(f"{COUNT} === 1")
+    assert browser.evaluate(STATUS) == ANSWER
+    text = " ".join(browser.evaluate("document.body.textContent").split())
+    assert "ml-2.00 m" in text
+    assert "mr2.00 m" in text
+    assert "straight50 %" in text
     # The markings of the car's lane are drawn in their blue.
+    shot = tmp_path / "console.png"
+    browser.screenshot(shot)
     picture = cv2.imread(str(shot))
     assert picture is not None
     assert picture.shape == (1000, 1360, 3)
@@ -81,45 +85,36 @@ def test_a_browser_shows_the_answer(service: Served, tmp_path: Path) -> None:
     assert blue[:, :900].sum() > 800
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with open_browser(tmp_path_factory.mktemp("profile")) as found:
-        yield found
-
-
 def green_share(browser: Browser) -> float:
     """Fraction of the shown picture with the green of the fake webcam."""
-    pixels = browser.run(
-        "const c = document.getElementById('picture');"
-        "return [...c.getContext('2d').getImageData(0, 0, c.width, 60).data];"
+    pixels = browser.evaluate(
+        f"[...{PICTURE}.getContext('2d').getImageData(0, 0, {PICTURE}.width, 60).data]"
     )
     colours = np.array(pixels).reshape(-1, 4)
     return float(np.mean((colours[:, 1] > 150) & (colours[:, 0] < 100) & (colours[:, 2] < 120)))
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(None in (CHROMIUM, DRIVER), reason=MISSING)
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_a_webcam_is_answered_picture_by_picture(service: Served, browser: Browser) -> None:
     browser.open(service.url)
     browser.wait(f"{COUNT} === 1")  # the answer for the first sample
-    browser.run("document.getElementById('webcam').click()")
+    browser.evaluate("document.getElementById('webcam').click()")
     browser.wait(f"{COUNT} >= 6")
-    status = browser.run("return document.getElementById('status').textContent")
-    assert status == "0.00 m left of the lane's centre, pointing 5.7° to the right."
-    size = browser.run("const c = document.getElementById('picture'); return c.width / c.height")
-    camera = browser.run(
-        "const v = document.getElementById('video'); return v.videoWidth / v.videoHeight"
-    )
+    assert browser.evaluate(STATUS) == ANSWER
+    size = browser.evaluate(f"{PICTURE}.width / {PICTURE}.height")
+    video = "document.getElementById('video')"
+    camera = browser.evaluate(f"{video}.videoWidth / {video}.videoHeight")
     assert size == pytest.approx(camera, abs=0.01)
     assert green_share(browser) > 0.1
-    browser.run("document.getElementById('stop').click()")
+    browser.evaluate("document.getElementById('stop').click()")
     browser.wait("document.getElementById('stop').hidden")
-    assert not browser.run("return document.getElementById('webcam').hidden")
-    assert browser.run("return document.getElementById('video').srcObject") is None
+    assert not browser.evaluate("document.getElementById('webcam').hidden")
+    assert browser.evaluate(f"{video}.srcObject") is None
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(None in (CHROMIUM, DRIVER), reason=MISSING)
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_a_film_is_answered_while_it_plays(
     service: Served, browser: Browser, tmp_path: Path
 ) -> None:

@@ -1,10 +1,7 @@
 """The page at /docs: Swagger UI with the complete OpenAPI document, without external requests."""
 
-import html
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -12,9 +9,8 @@ from fastapi import FastAPI
 
 from serve.api.console import docs_page
 from serve.config import Limits
+from tests.browser import CHROMIUM, MISSING, open_browser
 from tests.serve.conftest import Served, serving
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def embedded_document(page: str) -> object:
@@ -69,12 +65,10 @@ def test_the_page_needs_no_token_and_offers_to_enter_one(service: Served) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt-get install chromium)")
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_a_browser_renders_every_operation(service: Served, tmp_path: Path) -> None:
-    assert CHROMIUM is not None
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--virtual-time-budget=20000", "--dump-dom"]
-    command += [f"--user-data-dir={tmp_path}", f"{service.url}/docs"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    rendered = html.unescape(done.stdout)
-    for path in service.ask("GET", "/openapi.json").content["paths"]:
-        assert f'data-path="{path}"' in rendered
+    paths = service.ask("GET", "/openapi.json").content["paths"]
+    with open_browser(tmp_path, 1280, 900) as browser:
+        browser.open(f"{service.url}/docs")
+        for path in paths:
+            browser.wait(f"document.querySelector('[data-path=\"{path}\"]') !== null")

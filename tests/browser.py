@@ -1,4 +1,8 @@
-"""A headless Chromium, driven by its DevTools protocol."""
+"""A headless Chromium, controlled by its DevTools protocol.
+
+Its webcam is a fake one, which shows a green picture with a clock. A test waits for what the page
+shows: a limit in Chromium's virtual time ends too early on a busy machine.
+"""
 
 import base64
 import json
@@ -14,7 +18,12 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+MISSING = "no chromium (Debian: apt-get install chromium)"
 WAIT_S = 60.0
+OPTIONS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--use-fake-ui-for-media-stream",
+    "--use-fake-device-for-media-stream", "--remote-debugging-port=0",
+)  # fmt: skip
 
 
 class Browser:
@@ -34,22 +43,35 @@ class Browser:
                 assert "error" not in answer, answer
                 return answer["result"]
 
+    def open(self, url: str) -> None:
+        """Show `url` and wait until the page is loaded."""
+        self.call("Page.navigate", url=url)
+        self.wait("document.readyState === 'complete' && Boolean(document.body)")
+
     def evaluate(self, expression: str) -> Any:
+        """The value of a JavaScript expression in the page."""
         found = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def wait(self, expression: str) -> None:
-        """Until an expression holds."""
+    def wait(self, expression: str) -> Any:
+        """Wait until an expression is true; returns its value."""
         end = time.monotonic() + WAIT_S
-        while not self.evaluate(expression):
-            assert time.monotonic() < end, expression
+        while not (found := self.evaluate(expression)):
+            assert time.monotonic() < end, f"{expression} is not true after {WAIT_S} s"
             time.sleep(0.05)
+        return found
+
+    def choose_file(self, selector: str, path: Path) -> None:
+        """Choose the file of an input element."""
+        root = self.call("DOM.getDocument")["root"]["nodeId"]
+        node = self.call("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(path)])
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """By the mouse, from one place of the page to another, CSS px, in steps."""
+        """Drag the mouse in steps from one place of the page to another, CSS px."""
         self._mouse("mousePressed", start)
         for i in range(1, 6):
             share = i / 5
@@ -80,11 +102,10 @@ class Browser:
 
 
 @contextmanager
-def open_page(url: str, profile: Path, width: int, height: int) -> Iterator[Browser]:
-    """A page of `width` x `height` CSS px that shows `url`."""
+def open_browser(profile: Path, width: int, height: int) -> Iterator[Browser]:
+    """A page of `width` x `height` CSS px; `profile` is a folder for the browser's files."""
     assert CHROMIUM is not None
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
-    command += [f"--user-data-dir={profile}", "about:blank"]
+    command = [CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         file, end = profile / "DevToolsActivePort", time.monotonic() + WAIT_S
@@ -105,8 +126,6 @@ def open_page(url: str, profile: Path, width: int, height: int) -> Iterator[Brow
                 mobile=width < 600,
             )
             browser.call("Page.enable")
-            browser.call("Page.navigate", url=url)
-            browser.wait("document.readyState === 'complete' && Boolean(document.body)")
             yield browser
     finally:
         process.terminate()
