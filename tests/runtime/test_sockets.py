@@ -117,6 +117,7 @@ def test_a_connection_tries_all_addresses(listens: str) -> None:
             connect((other, port), 5)
 
 
+@pytest.mark.alone
 def test_addresses_that_do_not_answer_share_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     with bind("127.0.0.1", 0) as listener:
         listener.listen(0)

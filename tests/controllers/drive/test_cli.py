@@ -165,7 +165,7 @@ def test_a_service_that_dies_in_a_drive_is_one_error_line_and_the_log_is_kept(
         assert service.stdout is not None
         url = f"http://127.0.0.1:{service.stdout.readline().strip()}"
         done = run("drive", "--steps", "50", "--perception", url, "--log", str(log))
-        assert service.wait(10) == 9
+        assert service.wait(120) == 9
     assert done.returncode == 1, done.stdout
     assert url in error_line(done)
     assert len(log.read_text().splitlines()) == 1 + 5
