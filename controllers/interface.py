@@ -42,3 +42,5 @@ class LoopConfig:
     """Duration of a control step, s."""
     noisy: bool = False
     """Whether a perception estimates the state, with errors; otherwise the state is exact."""
+    delay_s: float | None = None
+    """By how much the perceived offset and angle are late, s; None if it is unknown."""

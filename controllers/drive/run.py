@@ -85,7 +85,9 @@ def drive(
     lane = choose_lane(config, road)
     steps = steps_for(config.steps, track.name, track.length_m)
     noisy = config.perception != "truth"
-    loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy)
+    # What is perceived on images is predicted to the present; a disturbance's delay is unknown.
+    delay_s = 0.0 if noisy and disturbance is None else None
+    loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy, delay_s=delay_s)
     if parameters is None:
         parameters = read_parameters(config.parameters, config.controller)
     controller = make_controller(config.controller, loop, parameters)

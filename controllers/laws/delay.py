@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from trackfeatures.errors import UserError
+
 Vector = NDArray[np.float64]
 
 MAX_DELAY = 4
@@ -23,14 +25,23 @@ class DelayEstimate:
     integrated yaw rate contain the noise, the change of the road's curvature kappa, which is small,
     and for a wrong delay the motion of the car. Their squares are compared for the delays of 0 to
     `MAX_DELAY` steps over the last `WINDOW` steps.
+
+    `known_s`: the delay, s, if it is known; then nothing is estimated. Raises UserError if it is
+    longer than `MAX_DELAY` steps.
     """
 
-    def __init__(self, dt: float) -> None:
+    def __init__(self, dt: float, known_s: float | None = None) -> None:
         self._dt = dt
-        self.steps = 0
+        self.steps = 0 if known_s is None else round(known_s / dt)
         """The delay that is assumed: 0 until the measurements contradict it."""
-        self.is_known = False
-        """Whether the measurements ever separated the delay from all others."""
+        if not 0 <= self.steps <= MAX_DELAY:
+            raise UserError(
+                f"the perception's delay is {known_s:g} s; lqr-kalman and mpc-kalman take 0 to "
+                f"{MAX_DELAY * dt:g} s"
+            )
+        self.is_known = known_s is not None
+        """Whether it was given, or the measurements ever separated it from all others."""
+        self._is_given = self.is_known
         self._rates = np.zeros(MAX_DELAY + 2)
         self._turned = np.zeros(MAX_DELAY + 1)  # rad, integrals of the yaw rate of so long ago
         self._residuals = np.zeros((2 * max(SPANS) + 1, MAX_DELAY + 1))
@@ -42,6 +53,8 @@ class DelayEstimate:
 
         Returns whether `steps` changed.
         """
+        if self._is_given:
+            return False
         self._rates[1:] = self._rates[:-1].copy()
         self._rates[0] = yaw_rate
         self._turned += 0.5 * self._dt * (self._rates[1:] + self._rates[:-1])

@@ -50,10 +50,10 @@ THIRD_DIFFERENCE = 20.0
 
 
 class StateEstimate:
-    """Estimates the state of each control step of `dt` s."""
+    """Estimates the state of each control step of `dt` s; `delay_s`: the delay, if it is known."""
 
-    def __init__(self, dt: float) -> None:
-        self.delay = DelayEstimate(dt)
+    def __init__(self, dt: float, delay_s: float | None = None) -> None:
+        self.delay = DelayEstimate(dt, delay_s)
         self.noise_variance = np.zeros(MEASURED)
         """Of (e, theta, vy, r), without limits."""
         self._table = transitions(dt)

@@ -7,8 +7,8 @@ delay of 0.1 s they oscillate.
 
 `LqrKalman` (`lqr-kalman`) minimises the paper's cost plus `wheel_rate` times the squared change of
 the wheel angle in a control step; the wheel angle is a fifth state. The wheel angle and heading of
-a steady bend are its set point, as in `LqrPreview`. Until the delay is known it uses gains that
-stay stable with any delay up to 0.2 s.
+a steady bend are its set point, as in `LqrPreview`. Until the delay is known, given by the loop or
+estimated, it uses gains that stay stable with any delay up to 0.2 s.
 
 `MpcKalman` (`mpc-kalman`) is `Mpc` on this state, with an arc of the estimated curvature as
 reference.
@@ -42,21 +42,28 @@ def make_lqr_kalman(
     loop: LoopConfig, *, wheel_rate: float = WHEEL_RATE, **weights: float
 ) -> "LqrKalman":
     """`LqrKalman` for a control loop; `weights` replace fields of its `LqrWeights`."""
-    return LqrKalman(loop.dt, replace(WEIGHTS, **weights), wheel_rate)
+    return LqrKalman(loop.dt, replace(WEIGHTS, **weights), wheel_rate, loop.delay_s)
 
 
 def make_mpc_kalman(loop: LoopConfig, **weights: float) -> "MpcKalman":
     """`MpcKalman` for a control loop; `weights` replace fields of its `MpcWeights`."""
-    return MpcKalman(loop.dt, replace(MPC_WEIGHTS, **weights))
+    return MpcKalman(loop.dt, replace(MPC_WEIGHTS, **weights), loop.delay_s)
 
 
 class LqrKalman:
-    """Linear quadratic regulator on the estimated state at a control step of `dt` s."""
+    """Linear quadratic regulator on the estimated state at a control step of `dt` s.
+
+    `delay_s`: the delay of the perception, if it is known; otherwise it is estimated.
+    """
 
     def __init__(
-        self, dt: float = 0.05, weights: LqrWeights = WEIGHTS, wheel_rate: float = WHEEL_RATE
+        self,
+        dt: float = 0.05,
+        weights: LqrWeights = WEIGHTS,
+        wheel_rate: float = WHEEL_RATE,
+        delay_s: float | None = None,
     ) -> None:
-        self.estimate = StateEstimate(dt)
+        self.estimate = StateEstimate(dt, delay_s)
         self.wheel_angle = 0.0
         """rad of the front wheels since the last control step."""
         self._gains = SpeedTable(lambda speed: smooth_gain(weights, wheel_rate, speed, dt))
@@ -85,10 +92,18 @@ class LqrKalman:
 
 
 class MpcKalman:
-    """Model predictive control on the estimated state at a control step of `dt` s."""
+    """Model predictive control on the estimated state at a control step of `dt` s.
 
-    def __init__(self, dt: float = 0.05, weights: MpcWeights = MPC_WEIGHTS) -> None:
-        self.estimate = StateEstimate(dt)
+    `delay_s`: the delay of the perception, if it is known; otherwise it is estimated.
+    """
+
+    def __init__(
+        self,
+        dt: float = 0.05,
+        weights: MpcWeights = MPC_WEIGHTS,
+        delay_s: float | None = None,
+    ) -> None:
+        self.estimate = StateEstimate(dt, delay_s)
         self._mpc = Mpc(dt, weights, preview=True)
         self._steer = 0.0
 

@@ -83,7 +83,7 @@ class MakePerceivedLaw:
     model: str
 
     def __call__(self, plan: "RoundPlan", world: "World", camera: "Camera") -> PerceivedLaw:
-        loop = LoopConfig(1.0 / world.frequency_hz, noisy=True)
+        loop = LoopConfig(1.0 / world.frequency_hz, noisy=True, delay_s=0.0)
         perceive = CameraPerception(camera, _load(self.model))
         return PerceivedLaw(self.controller, loop, perceive, world)
 

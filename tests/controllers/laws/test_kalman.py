@@ -11,6 +11,7 @@ from controllers.laws.delay import MAX_DELAY, DelayEstimate
 from controllers.laws.kalman import CAR, KAPPA, StateEstimate, transitions
 from controllers.laws.lqr_gains import GRID_M_S, SLOWEST_M_S
 from trackfeatures import RoadClass
+from trackfeatures.errors import UserError
 
 DT = 0.05
 SPEED = 15.0
@@ -35,6 +36,19 @@ def test_the_delay_of_the_heading_is_found(delay: int, noise: float) -> None:
         found.update(seen, rate[now] + 0.01 * noise * rng.normal())
     assert found.is_known
     assert found.steps == delay
+
+
+def test_a_given_delay_is_kept() -> None:
+    theta, rate = motion(400)
+    found = DelayEstimate(DT, 0.1)
+    assert found.is_known
+    assert not any(found.update(theta[now], rate[now]) for now in range(400))
+    assert found.steps == 2
+
+
+def test_a_given_delay_that_is_too_long_is_refused() -> None:
+    with pytest.raises(UserError, match=r"delay is 0\.25 s; .* take 0 to 0\.2 s"):
+        DelayEstimate(DT, 0.25)
 
 
 def test_without_motion_the_delay_stays_unknown() -> None:

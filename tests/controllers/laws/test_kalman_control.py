@@ -7,7 +7,8 @@ from controllers.drive.closed_loop import DriveResult
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.run import drive
-from controllers.laws.kalman import CAR
+from controllers.interface import Observation
+from controllers.laws.kalman import CAR, StateEstimate, Vector
 from controllers.laws.kalman_control import smooth_gain
 from controllers.laws.lqr_gains import LqrWeights, discrete_gain
 
@@ -55,3 +56,22 @@ def test_with_a_delay_the_score_is_near_that_without(controller: str) -> None:
 def test_without_disturbance_nothing_is_lost(controller: str) -> None:
     plain = driven(controller.removesuffix("-kalman"), "none")[0]
     assert driven(controller, "none")[0].score_per_step > plain.score_per_step - 0.0003
+
+
+@pytest.mark.parametrize("controller", ESTIMATED)
+def test_a_drive_on_images_knows_that_its_answers_are_predicted_to_the_present(
+    controller: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known: list[bool] = []
+    real = StateEstimate.update
+
+    def update(self: StateEstimate, seen: Observation, wheel_angle: float) -> Vector:
+        known.append(self.delay.is_known)
+        return real(self, seen, wheel_angle)
+
+    monkeypatch.setattr(StateEstimate, "update", update)
+    config = DriveConfig(controller=controller, perception="model", track="oval", steps=2)
+    drive(config)
+    assert known == [True, True]
+    drive(config, disturbance=DISTURBANCES["noise"])
+    assert known == [True, True, False, False]
