@@ -1,7 +1,7 @@
 """Observations: the paper's state vector, a camera view, or a dict of state, views and sensors."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, get_args
 
@@ -51,11 +51,19 @@ class ObservationOptions:
     def __post_init__(self) -> None:
         if self.observation is not None and self.observation not in KINDS:
             raise UserError(f"observation is {self.observation!r}; choose {', '.join(KINDS)}")
-        for name, value in (("views", self.views), ("sensors", self.sensors)):
+        for name, value in (("views", self.views or ()), ("sensors", self.sensors)):
             if isinstance(value, str):
                 raise UserError(f'{name} is {value!r}; give a list, as in {name}=("{value}",)')
-        if not (math.isfinite(self.noise) and self.noise >= 0.0):
-            raise UserError(f"noise is {self.noise}; give a standard deviation of 0 or more")
+            if not isinstance(value, Collection):
+                raise UserError(f"{name} is {value!r}; give a list")
+        number = isinstance(self.noise, int | float | np.number)
+        if not (number and math.isfinite(self.noise) and self.noise >= 0.0):
+            raise UserError(f"noise is {self.noise!r}; give a standard deviation of 0 or more")
+        if not isinstance(self.sensor_noise, Mapping):
+            raise UserError(
+                f"sensor_noise is {self.sensor_noise!r}; give a dict of standard deviations by "
+                "the sensors' names"
+            )
 
     @property
     def state_noise(self) -> float:

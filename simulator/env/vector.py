@@ -22,12 +22,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from simulator import MAX_STEPS
+from simulator.bounds import check_whole
 from simulator.env.action import action_space, naming_car, to_rows
 from simulator.env.cars import Cars
 from simulator.env.control_step import ENDED, REWARD
 from simulator.env.errors import NotCopyable, ResetNeeded
 from simulator.env.observation import Kind, read_from_beams
 from simulator.env.options import DriveOptions, split_options
+from simulator.env.start import reset_options
 from simulator.env.vector_info import vector_info
 from simulator.env.vector_observer import VectorObserver
 from simulator.env.vector_pictures import checked_workers
@@ -79,10 +81,13 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         copy: bool = True,
         **options: Any,
     ) -> None:
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise UserError(f"num_envs is {num_envs!r}; give a whole number of 1 or more")
-        if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise UserError(f"threads is {threads!r}; give a whole number of 1 or more, or None")
+        num_envs = check_whole("num_envs", num_envs, 1)
+        for name, value in (("threads", threads), ("max_episode_steps", max_episode_steps)):
+            if value is not None:
+                check_whole(name, value, 1)
+        if not isinstance(copy, bool):
+            raise UserError(f"copy is {copy!r}; give True or False")
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
         given = {"track": track, "lanes": lanes} | options
@@ -114,7 +119,6 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             copy=copy,
         )
         self._frequency_hz, self._controls = drive.frequency_hz, drive.controls
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": drive.frequency_hz,
@@ -141,7 +145,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         """Begin an episode of each car, or of those of `options["reset_mask"]` (N,) bool. The other
         options are those of a single environment; each is a number, a list with one for each car,
         or a range (least, greatest)."""
-        given = dict(options or {})
+        if self.closed:
+            raise UserError("this environment is closed; make a new one")
+        given = reset_options(options)
         chosen = self._mask(given.pop(MASK, None))
         seeds = self._seeds(seed)
         starts = self._starts(given)
@@ -261,14 +267,18 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + number for number in range(self.num_envs)]
+        if not isinstance(seed, list | tuple | np.ndarray):
+            return [check_whole("seed", seed) + number for number in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise UserError(
                 f"seed is a list of {len(seed)} for {self.num_envs} cars; give one for each, or "
                 "one whole number"
             )
-        return list(seed)
+        seeds = []
+        for number, own in enumerate(seed):
+            with naming_car(number, self.num_envs):
+                seeds.append(None if own is None else check_whole("seed", own))
+        return seeds
 
     def _starts(self, given: dict[str, Any]) -> list[dict[str, Any]]:
         listed, shared = _lists(given, self.num_envs)
@@ -310,6 +320,15 @@ class DriverViewVector(LateralControlVector):
     """`num_envs` cars, each as in an environment `DriverView` of its own."""
 
     kind: ClassVar[Kind] = "dict"
+
+
+def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError:
+        raise UserError(
+            f"autoreset_mode is {given!r}; choose NextStep, SameStep or Disabled"
+        ) from None
 
 
 def _default_threads(count: int) -> int:

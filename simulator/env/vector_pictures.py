@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.bounds import check_whole
 from simulator.env.cars import Cars
 from simulator.env.view_renderer import RenderOptions
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
-from trackfeatures.errors import UserError
 
 
 class VectorPictures:
@@ -87,6 +87,4 @@ def checked_workers(workers: Any, cars: int) -> int:
     """The number of processes for an option `workers`; None: one for each core."""
     if workers is None:
         workers = len(os.sched_getaffinity(0))
-    elif not isinstance(workers, int | np.integer) or isinstance(workers, bool) or workers < 1:
-        raise UserError(f"workers is {workers!r}; give a whole number of 1 or more, or None")
-    return min(int(workers), cars)
+    return min(check_whole("workers", workers, 1), cars)

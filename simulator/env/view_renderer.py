@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.bounds import check_whole
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
@@ -39,12 +40,16 @@ class RenderOptions:
     def __post_init__(self) -> None:
         from simulator.camera import VIEWS, check_light, check_size
 
-        check_size(self.width, self.height)
+        check_size(check_whole("width", self.width), check_whole("height", self.height))
+        check_whole("light_seed", self.light_seed)
         check_light(self.light)
         if self.render_view not in VIEWS:
             raise UserError(
                 f"render_view is {self.render_view!r}; the views are {', '.join(VIEWS)}"
             )
+
+        if self.mount is not None and not isinstance(self.mount, CameraParameters):
+            raise UserError(f"mount is {self.mount!r}; give a CameraParameters, or None")
 
     @property
     def camera(self) -> CameraParameters:
