@@ -15,6 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from controllers.interface import Controller, LoopConfig, Observation
 from controllers.laws.actor import is_actor
 from trackfeatures.errors import UserError
@@ -115,7 +117,13 @@ def make_controller(
             raise UserError(f"{name}: {parameter} is {value}; give a finite number of 0 or more")
     module, _, function = entry.factory.partition(":")
     make: Callable[..., Controller] = getattr(importlib.import_module(module), function)
-    return make(loop, **given)
+    try:
+        return make(loop, **given)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        limits = ", ".join(f"{each} {entry.tunable[each]}" for each in given)
+        raise UserError(
+            f"{name}: there are no gains for {given} ({error}); usual limits are {limits}"
+        ) from error
 
 
 def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:

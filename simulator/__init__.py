@@ -10,7 +10,10 @@ ENVIRONMENTS = {
     "driverview/LateralControl-v0": "simulator.env:LateralControl",
     "driverview/DriverView-v0": "simulator.env:DriverView",
 }
-VECTORS = {"driverview/LateralControl-v0": "simulator.env.vector:LateralControlVector"}
+VECTORS = {
+    "driverview/LateralControl-v0": "simulator.env.vector:LateralControlVector",
+    "driverview/DriverView-v0": "simulator.env.vector:DriverViewVector",
+}
 """Classes that step many cars in one call, for `gymnasium.make_vec`."""
 MAX_STEPS = 6500
 """The paper's longest episode, in control steps."""
@@ -25,7 +28,7 @@ def register_environments() -> None:
             gymnasium.register(
                 id=name,
                 entry_point=entry_point,
-                vector_entry_point=VECTORS.get(name),
+                vector_entry_point=VECTORS[name],
                 max_episode_steps=MAX_STEPS,
             )
 

@@ -61,14 +61,20 @@ class StateEstimate:
         self._own = np.zeros((MAX_DELAY + 2, 4))  # vx, vy, yaw rate, wheel angle; newest first
         self._recent = np.zeros((4, MEASURED))
         self._steps = 0
+        self._last = np.array([0.0, 0.0, SLOWEST_M_S, 0.0, 0.0])
+
+    @property
+    def speed(self) -> float:
+        """vx (m/s) of the last control step."""
+        return float(self._last[2])
 
     def update(self, observation: Observation, wheel_angle: float) -> Vector:
         """The present state (5,) from the observation of this control step.
 
-        `wheel_angle` (rad): of the front wheels since the last control step.
+        `wheel_angle` (rad): of the front wheels since the last control step. A measurement that is
+        not finite counts as unchanged: in the filter it would stay for ever.
         """
-        seen = np.array([observation.to_lane_centre, -observation.angle])
-        own = np.array([observation.vx, observation.vy, observation.yaw_rate])
+        seen, own = self._measurements(observation)
         self._own[1:] = self._own[:-1].copy()
         self._own[0, :3], self._own[1, 3] = own, wheel_angle
         if self._steps == 0:
@@ -79,7 +85,7 @@ class StateEstimate:
             self._covariance[:] = np.diag(START_STD**2)
         self._note_noise(np.array([*seen, *own[1:]]))
         self._steps += 1
-        share = min(max(observation.vx / USUAL_M_S, SLOWEST_SHARE), 1.0)
+        share = min(max(self.speed / USUAL_M_S, SLOWEST_SHARE), 1.0)
         return advance(
             self._x,
             self._covariance,
@@ -90,6 +96,17 @@ class StateEstimate:
             (PROCESS_STD * share) ** 2,
             self.delay.steps,
         )
+
+    def _measurements(self, observation: Observation) -> tuple[Vector, Vector]:
+        """Offset and heading error (2,) of the image; vx, vy and yaw rate (3,) of the car."""
+        given = np.array(
+            [
+                *(observation.to_lane_centre, -observation.angle),
+                *(observation.vx, observation.vy, observation.yaw_rate),
+            ]
+        )
+        self._last = np.where(np.isfinite(given), given, self._last)
+        return self._last[:2], self._last[2:]
 
     def _note_noise(self, measured: Vector) -> None:
         self._recent[1:] = self._recent[:-1].copy()

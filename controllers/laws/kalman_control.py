@@ -75,7 +75,7 @@ class LqrKalman:
     def update(self, observation: Observation) -> float:
         state = self.estimate.update(observation, self.wheel_angle)
         offset, theta, vy, yaw_rate, curvature = state.tolist()
-        speed = max(observation.vx, SLOWEST_M_S)
+        speed = max(self.estimate.speed, SLOWEST_M_S)
         gains = self._gains if self.estimate.delay.is_known else self._cautious
         k1, k2, k3, k4, k5 = gains(speed).tolist()
         wheel_per_bend, theta_per_bend = self._steady_bends(speed).tolist()
@@ -114,6 +114,7 @@ class MpcKalman:
             observation,
             to_lane_centre=offset,
             angle=-theta,
+            vx=self.estimate.speed,
             vy=vy,
             yaw_rate=yaw_rate,
             curvature=curvature,

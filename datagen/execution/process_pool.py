@@ -12,6 +12,7 @@ from time import monotonic
 
 from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
 from datagen.recorder.job import FramesDone, Job, Message, worker_main
+from runtime.worker_threads import thread_limits
 
 STOP_S = 5.0  # s: for a process to end, before it is killed
 CONTEXT = multiprocessing.get_context("spawn")  # graphics contexts do not survive a fork
@@ -168,13 +169,3 @@ def _single_threaded(workers: int) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-def thread_limits(workers: int) -> dict[str, str]:
-    """Environment variables that give each of `workers` processes its share of the cores."""
-    share = (os.cpu_count() or 1) // workers
-    return {
-        "LP_NUM_THREADS": str(share if share > 1 else 0),
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    }

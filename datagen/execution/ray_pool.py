@@ -16,10 +16,10 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from datagen.execution.process_pool import thread_limits
 from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
 from datagen.recorder.job import AttemptFailed, FramesDone, Job, Outcome, RoundDone, attempt
 from datagen.recording.folder import discard_partial, partial_path, prepare, publish
+from runtime.worker_threads import thread_limits
 from trackfeatures.errors import UserError
 
 POLL_S = 0.5

@@ -46,6 +46,8 @@ class LabelFolder:
         self.folder = folder.resolve()
         self._model = model
         self._lock = Lock()
+        self._rows: tuple[object, dict[str, Cells]] = (None, {})
+        self._picture: tuple[object, NDArray[np.uint8]] = (None, np.empty(0, np.uint8))
         self.files = self._find()
         if not self.files:
             raise UserError(f"there is no picture in {folder}")
@@ -80,18 +82,32 @@ class LabelFolder:
         return sorted(found, key=natural_key)
 
     def rows(self) -> dict[str, Cells]:
-        """Rows of `labels.csv` by file; empty if there is no such file."""
+        """Rows of `labels.csv` by file; empty if there is no such file.
+
+        They are read again when the file has changed; do not change what is returned.
+        """
         path = self.folder / LABELS
         if not path.is_file():
             return {}
-        return {cells["file"]: cells for _, cells in read_cells(path)}
+        version = _version(path)
+        if self._rows[0] != version:
+            self._rows = version, {cells["file"]: cells for _, cells in read_cells(path)}
+        return self._rows[1]
 
     def picture(self, number: int) -> NDArray[np.uint8]:
-        """The whole picture, uint8 RGB (H, W, 3). Raises UserError."""
+        """The whole picture, uint8 RGB (H, W, 3), read-only. Raises UserError.
+
+        The last one is kept: each drag of a marking asks for it again.
+        """
         path = self.folder / self.files[number]
         if not path.resolve().is_relative_to(self.folder):
             raise UserError(f"{self.files[number]} leads out of the folder")
-        return read_whole_image(path)
+        version, (kept, picture) = _version(path), self._picture
+        if kept != version:
+            picture = read_whole_image(path)
+            picture.flags.writeable = False
+            self._picture = version, picture
+        return picture
 
     def camera(self, number: int, width: int, height: int) -> CameraParameters:
         """Camera of a picture, at the picture's size. Raises UserError."""
@@ -149,15 +165,24 @@ class LabelFolder:
     def remove(self, number: int) -> None:
         """Remove the label of a picture, if it has one."""
         with self._lock:
-            rows = self.rows()
-            if rows.pop(self.files[number], None) is not None:
-                self._write(rows)
+            rows, name = self.rows(), self.files[number]
+            if name in rows:
+                self._write({each: row for each, row in rows.items() if each != name})
 
     def _write(self, rows: dict[str, Cells]) -> None:
         if rows:
             write_cells(self.folder / LABELS, [rows[k] for k in sorted(rows, key=natural_key)])
         else:
             (self.folder / LABELS).unlink(missing_ok=True)
+
+
+def _version(path: Path) -> tuple[object, ...]:
+    """Differs for another file and after each change of one. Raises UserError without the file."""
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    return path, found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def _sides(row: Cells) -> tuple[float, float] | None:

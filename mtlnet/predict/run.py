@@ -67,8 +67,10 @@ def predict_files(
     for path in outputs:
         require_other_file(path, [file for source in usable for file in source.files])
     for source in sources:
-        if source.problem:
+        if source.problem and len(sources) > 1:  # the problem of the only one is the error
             note(source.problem)
+    if not usable:
+        outputs = ()  # what an earlier run wrote stays
     sources = [with_lens(source, camera, lens, note, calibrate=calibrate) for source in sources]
     answers = _Answers(engine, sum(source.count for source in sources), report)
     with ExitStack() as stack:

@@ -33,6 +33,7 @@ from simulator.env.control_step import REWARD, SCORE
 from simulator.env.errors import NotCopyable, ResetNeeded
 from simulator.env.observation import Kind, Observation, Observer, read_from_beams
 from simulator.env.options import OPTIONS, DriveOptions, split_options
+from simulator.env.start import reset_options
 from simulator.env.view_renderer import ViewRenderer
 from simulator.world.fleet import COMMAND_AT
 from simulator.world.world import World
@@ -100,7 +101,7 @@ class LateralControl(gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
-        self._observer.restart(self._cars.reset(0, self.np_random, options or {}))
+        self._observer.restart(self._cars.reset(0, self.np_random, reset_options(options)))
         self._renderer.change_road(self.world.road)
         self._running = True
         self._steps = 0

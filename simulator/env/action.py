@@ -30,7 +30,7 @@ NAMES: dict[str, tuple[str, ...]] = {"steer": ("steer",), "full": tuple(LIMITS)}
 
 def check_controls(controls: str) -> None:
     """Raises UserError unless `controls` is one of NAMES."""
-    if controls not in NAMES:
+    if not isinstance(controls, str) or controls not in NAMES:
         raise UserError(f'controls is {controls!r}; choose "steer" or "full"')
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from simulator.env.options import DriveOptions, draw
+from simulator.env.options import DriveOptions, draw, ends_of
 from simulator.env.start import check_start
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
@@ -14,7 +14,7 @@ from simulator.track.random_roads.road import RANDOM, random_name
 from simulator.track.road import Road
 from simulator.varied.road import make_road
 from simulator.world.fleet import Fleet
-from simulator.world.world import World
+from simulator.world.world import World, check_place
 
 RANDOM_ROADS = 256
 """Number of roads of `track="random"`: making one takes some 30 ms, so that each is made once."""
@@ -69,9 +69,15 @@ class Drive:
 
     def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The start of an episode with the `given` options of `reset`, before anything is drawn.
-        Raises UserError for an unknown option or a value that is no number."""
+        Raises UserError for an unknown option, a value that is no number, and a place that is not
+        on the road; a road that is still to be drawn may be narrower."""
         start = {**self._options.start, **given}
-        check_start({name: draw(value, None) for name, value in start.items()}, self.world.road)
+        ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
+        for end in (0, 1):
+            values = {name: ranges[name][end] if name in ranges else start[name] for name in start}
+            place = check_start(values, self.world.road)
+            if not self._draws_road:
+                check_place(self.world.road, **place)
         return start
 
     def _make_world(self, rng: np.random.Generator | None) -> World:
@@ -96,3 +102,7 @@ class Drive:
         if isinstance(options.lane_width, tuple):
             width = round(width, 1)
         return self._roads.road(options, track, lanes, width)
+
+
+def _is_range(setting: Any) -> bool:
+    return isinstance(setting, tuple)

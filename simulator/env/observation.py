@@ -1,16 +1,16 @@
 """Observations: the paper's state vector, a camera view, or a dict of state, views and sensors."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
-from simulator.env.view_renderer import ViewRenderer
+from simulator.env.view_renderer import RenderOptions
 from simulator.sensors.sensor import Reading, Sensor, SensorSuite
 from simulator.sensors.standard import CAMERA, picture_sensor, read_track_range, sensors_of
 from simulator.world.world import World
@@ -51,11 +51,19 @@ class ObservationOptions:
     def __post_init__(self) -> None:
         if self.observation is not None and self.observation not in KINDS:
             raise UserError(f"observation is {self.observation!r}; choose {', '.join(KINDS)}")
-        for name, value in (("views", self.views), ("sensors", self.sensors)):
+        for name, value in (("views", self.views or ()), ("sensors", self.sensors)):
             if isinstance(value, str):
                 raise UserError(f'{name} is {value!r}; give a list, as in {name}=("{value}",)')
-        if not (math.isfinite(self.noise) and self.noise >= 0.0):
-            raise UserError(f"noise is {self.noise}; give a standard deviation of 0 or more")
+            if not isinstance(value, Collection):
+                raise UserError(f"{name} is {value!r}; give a list")
+        number = isinstance(self.noise, int | float | np.number)
+        if not (number and math.isfinite(self.noise) and self.noise >= 0.0):
+            raise UserError(f"noise is {self.noise!r}; give a standard deviation of 0 or more")
+        if not isinstance(self.sensor_noise, Mapping):
+            raise UserError(
+                f"sensor_noise is {self.sensor_noise!r}; give a dict of standard deviations by "
+                "the sensors' names"
+            )
 
     @property
     def state_noise(self) -> float:
@@ -88,6 +96,17 @@ class ObservationOptions:
         return replace(self, observation=chosen, views=views)
 
 
+class Renderer(Protocol):
+    """Draws views of one car's world."""
+
+    @property
+    def options(self) -> RenderOptions: ...
+
+    def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Copies of the views of the current state, in the order of `views`."""
+        ...
+
+
 class Observer:
     """Builds the observations of one car; `options` must be resolved.
 
@@ -96,9 +115,9 @@ class Observer:
     """
 
     def __init__(
-        self, options: ObservationOptions, renderer: ViewRenderer, beams: FloatArray | None = None
+        self, options: ObservationOptions, renderer: Renderer, beams: FloatArray | None = None
     ) -> None:
-        self._kind = options.observation
+        self.kind = options.observation
         self._renderer = renderer
         self.views = tuple(options.views or ())
         sensors = sensors_of(self._replace_camera(options.sensors))
@@ -109,10 +128,10 @@ class Observer:
                 for sensor in sensors
             )
         self.suite = SensorSuite(sensors, noise=options.sensor_noise)
-        self.batched = not self.views and all(
+        self.batched = all(
             sensor.name in from_beams and not sensor.noise for sensor in self.suite.sensors
         )
-        """Whether the observation consists of the state and of exact range beams only."""
+        """Whether exact range beams are the only sensors."""
         self._limit = options.limit
         self.space = self._space()
 
@@ -122,26 +141,31 @@ class Observer:
 
     def observe(self, world: World, state: NDArray[np.float32]) -> Observation:
         """The observation of the current state; `state` (7,) is a part of it."""
-        if self._kind == "image":
+        if self.kind == "image":
             return self._renderer.render(world, self.views)[self.views[0]]
-        if self._kind == "state":
+        if self.kind == "state":
             return state
         observed: dict[str, NDArray[Any]] = {STATE: state}
         if self.views:
             images = self._renderer.render(world, self.views)
-            observed |= {self._key(view): image for view, image in images.items()}
-        for sensor, reading in zip(
-            self.suite.sensors, self.suite.read(world).values(), strict=True
-        ):
-            observed[sensor.name] = _as_array(reading, sensor.dtype)
-        return observed
+            observed |= {self.key(view): image for view, image in images.items()}
+        return observed | self.read_sensors(world)
+
+    def read_sensors(self, world: World) -> dict[str, NDArray[Any]]:
+        """The readings of the current state by the sensors' names."""
+        return {
+            sensor.name: _as_array(reading, sensor.dtype)
+            for sensor, reading in zip(
+                self.suite.sensors, self.suite.read(world).values(), strict=True
+            )
+        }
 
     def _space(self) -> gym.Space[Any]:
         state = gym.spaces.Box(-self._limit, self._limit, (STATE_SIZE,), np.float32)
-        views = {self._key(view): self._renderer.space(view) for view in self.views}
-        if self._kind == "state":
+        views = {self.key(view): self._renderer.options.space(view) for view in self.views}
+        if self.kind == "state":
             return state
-        if self._kind == "image":
+        if self.kind == "image":
             return next(iter(views.values()))
         sensors = {sensor.name: _sensor_space(sensor) for sensor in self.suite.sensors}
         clash = sorted({STATE, *views} & set(sensors))
@@ -149,14 +173,17 @@ class Observer:
             raise UserError(f"sensors are named like other parts of the observation: {clash}")
         return gym.spaces.Dict({STATE: state, **views, **sensors})
 
-    def _key(self, view: str) -> str:
+    def key(self, view: str) -> str:
+        """The name of a view in an observation that is a dict."""
         return IMAGE if len(self.views) == 1 else view
 
     def _replace_camera(self, sensors: Sequence[str | Sensor]) -> list[str | Sensor]:
         """Replace the name "camera" by a sensor that renders the driver's view."""
         renderer = self._renderer
         camera = picture_sensor(
-            CAMERA, lambda world: renderer.render(world, ("front",))["front"], renderer.shape
+            CAMERA,
+            lambda world: renderer.render(world, ("front",))["front"],
+            renderer.options.shape,
         )
         return [camera if sensor == CAMERA else sensor for sensor in sensors]
 

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 import trackfeatures as tf
+from simulator.bounds import check_whole
 from simulator.env.action import Controls, check_controls
 from simulator.env.observation import ObservationOptions
 from simulator.env.reward import EpisodeOptions
 from simulator.env.start import OPTIONS as START_OPTIONS
 from simulator.env.view_renderer import RenderOptions
+from simulator.track.random_roads.road import RANDOM
 from simulator.vehicle.car import CarParameters
+from simulator.world.control_rate import check_frequency
 from trackfeatures.errors import UserError
 
 Setting = float | tuple[float, float]
@@ -59,20 +62,26 @@ class DriveOptions:
 
     def __post_init__(self) -> None:
         check_controls(self.controls)
+        check_frequency(check_whole("frequency_hz", self.frequency_hz, 1))
+        check_whole("road_seed", self.road_seed)
+        if not isinstance(self.track, str):
+            raise UserError(f'track is {self.track!r}; give a name, a file, or "{RANDOM}", as text')
         for name in ("friction", "mass"):
-            for value in _ends(name, getattr(self, name)):
+            for value in ends_of(name, getattr(self, name)):
                 if not value > 0.0:
                     raise UserError(f"{name} is {value:g}; give a factor above 0")
-        if isinstance(self.lanes, tuple):
-            for lanes in _ends("lanes", self.lanes):
-                tf.check_lanes(int(lanes), tf.LANE_WIDTH_M)
-        if isinstance(self.lane_width, tuple):
-            for width in _ends("lane_width", self.lane_width):
+        ranged = isinstance(self.lanes, tuple)
+        for lanes in ends_of("lanes", self.lanes) if ranged else (self.lanes,):
+            tf.check_lanes(lanes, tf.LANE_WIDTH_M)
+        if self.lane_width is not None:
+            for width in ends_of("lane_width", self.lane_width):
                 tf.check_lanes(1, width)
+        if not isinstance(self.start, Mapping):
+            raise UserError(f"start is {self.start!r}; give a dict of {', '.join(START_OPTIONS)}")
         for name, setting in self.start.items():
             if name not in START_OPTIONS:
                 raise UserError(f"start has {name!r}; it takes {', '.join(START_OPTIONS)}")
-            _ends(name, setting)
+            ends_of(name, setting)
 
     def car(self, rng: np.random.Generator | None) -> CarParameters:
         """The car of an episode; `rng` draws from ranges, None takes their least values."""
@@ -121,7 +130,7 @@ def draw(setting: Any, rng: np.random.Generator | None) -> Any:
     return setting[0] if rng is None else float(rng.uniform(*setting))
 
 
-def _ends(name: str, setting: Any) -> tuple[float, ...]:
+def ends_of(name: str, setting: Any) -> tuple[float, ...]:
     """The number of a setting, or both ends of its range. Raises UserError for anything else."""
     given = setting if isinstance(setting, tuple) else (setting, setting)
     try:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+
 from runtime.jit import compiled
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
@@ -109,14 +111,15 @@ class EpisodeOptions:
                 f"reward is {self.reward!r}; give a function of (state, road, ending), or None "
                 "for the default reward"
             )
-        if not math.isfinite(self.lambda_):
-            raise UserError(f"lambda_ is {self.lambda_}; give a finite weight")
+        number = isinstance(self.lambda_, int | float | np.number)
+        if not (number and math.isfinite(self.lambda_)):
+            raise UserError(f"lambda_ is {self.lambda_!r}; give a finite weight")
         if self.reward is not None and self.lambda_ != 1.0:
             raise UserError(
                 "lambda_ is a weight of the default reward; leave it out if `reward` is given"
             )
-        unknown = [self.ends] if isinstance(self.ends, str) else set(self.ends) - set(ENDINGS)
-        if unknown:
+        listed = isinstance(self.ends, Collection) and not isinstance(self.ends, str)
+        if not listed or any(event not in ENDINGS for event in self.ends):
             raise UserError(
                 f"ends is {self.ends!r}; give a list of the events that end an episode, out of "
                 f"{', '.join(ENDINGS)}"

@@ -11,6 +11,13 @@ from trackfeatures.errors import UserError
 OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
+def reset_options(options: Any) -> dict[str, Any]:
+    """The options given to `reset`. Raises UserError unless they are a dict or None."""
+    if options is not None and not isinstance(options, Mapping):
+        raise UserError(f"options is {options!r}; give a dict, or None")
+    return dict(options or {})
+
+
 def check_start(options: Mapping[str, Any], road: Road) -> dict[str, float]:
     """The arguments of `World.reset` for `options`, as floats; a value that exceeds its bound by
     the rounding of float32 is clipped. An option that is None is left out.

@@ -6,41 +6,48 @@
     )
 
 Each car has the same numbers, bit for bit, as one environment with the car's options and seed.
+Pictures are drawn by worker processes.
 """
 
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from simulator import MAX_STEPS
+from simulator.bounds import check_whole
 from simulator.env.action import action_space, naming_car, to_rows
 from simulator.env.cars import Cars
 from simulator.env.control_step import ENDED, REWARD
 from simulator.env.errors import NotCopyable, ResetNeeded
-from simulator.env.observation import STATE, Kind, Observer, read_from_beams
+from simulator.env.observation import Kind, read_from_beams
 from simulator.env.options import DriveOptions, split_options
+from simulator.env.start import reset_options
 from simulator.env.vector_info import vector_info
-from simulator.env.view_renderer import ViewRenderer
+from simulator.env.vector_observer import VectorObserver
+from simulator.env.vector_pictures import checked_workers
+from simulator.env.view_renderer import RenderOptions
 from simulator.world.fleet import COMMAND_AT, STEPS
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
+LOOK = ("light", "light_seed")
 PER_CAR = (
     *("track", "lanes", "lane_width", "roads", "road_seed"),
-    *("traffic", "friction", "mass", "start"),
+    *("traffic", "friction", "mass", "start", *LOOK),
 )
 """Options that may be lists with one entry for each car."""
 CARS_PER_THREAD = 32
 """Least number of cars for which a thread of their own saves time."""
 MASK = "reset_mask"
+Options = TypeVar("Options", DriveOptions, RenderOptions)
 
 
 class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
@@ -49,9 +56,13 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     The options are those of `LateralControl`. Each option of PER_CAR, and each number of `start`,
     is one value for all cars or a list with one entry for each car. An entry that is a tuple
     (least, greatest) is a range, from which each episode draws a number. `threads`: at most this
-    many threads step the cars; None: one for each core, but at least 32 cars a thread.
+    many threads step the cars; None: one for each core, but at least 32 cars a thread. `workers`:
+    so many processes draw the pictures, if there are any; None: one for each core. copy=False:
+    the pictures of an observation are those in the memory shared with the workers, which the next
+    `step` or `reset` overwrites.
 
     Raises UserError for bad options and actions; its message names the car, and no car has moved.
+    Raises PictureWorkerError when a worker dies; `reset` starts others.
     """
 
     kind: ClassVar[Kind] = "state"
@@ -66,12 +77,17 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         max_episode_steps: int | None = MAX_STEPS,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
+        workers: int | None = None,
+        copy: bool = True,
         **options: Any,
     ) -> None:
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise UserError(f"num_envs is {num_envs!r}; give a whole number of 1 or more")
-        if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise UserError(f"threads is {threads!r}; give a whole number of 1 or more, or None")
+        num_envs = check_whole("num_envs", num_envs, 1)
+        for name, value in (("threads", threads), ("max_episode_steps", max_episode_steps)):
+            if value is not None:
+                check_whole(name, value, 1)
+        if not isinstance(copy, bool):
+            raise UserError(f"copy is {copy!r}; give True or False")
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
         given = {"track": track, "lanes": lanes} | options
@@ -82,10 +98,11 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             if starts:
                 listed["start"] = [start | own for own in _of_each_car(starts, num_envs)]
                 del shared["start"]
+        looks = {name: listed.pop(name) for name in LOOK if name in listed}
         drive, episode, observation, picture = split_options(shared)
         observation = observation.resolved(self.kind)
         self._cars = Cars(
-            _drives(drive, listed, num_envs),
+            _with_lists(drive, listed, num_envs),
             episode,
             noise=observation.state_noise,
             limit=observation.limit,
@@ -93,29 +110,27 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             threads=threads or _default_threads(num_envs),
         )
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._renderers = [
-            ViewRenderer(self.world(number).road, picture) for number in range(num_envs)
-        ]
-        self._render_view = picture.render_view
-        self._observers = [
-            Observer(observation, renderer, self._cars.beams_of(number))
-            for number, renderer in enumerate(self._renderers)
-        ]
+        self._observer = VectorObserver(
+            self._cars,
+            observation,
+            _with_lists(picture, looks, num_envs),
+            render_view=picture.render_view if render_mode else None,
+            workers=checked_workers(workers, num_envs),
+            copy=copy,
+        )
         self._frequency_hz, self._controls = drive.frequency_hz, drive.controls
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": drive.frequency_hz,
             "autoreset_mode": self.autoreset_mode,
         }
         self.single_action_space = action_space(drive.controls)
-        self.single_observation_space = self._observers[0].space
+        self.single_observation_space = self._observer.single_space
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.observation_space = self._observer.space
         self._rngs: list[np.random.Generator] = []
         self._max_steps = max_episode_steps or np.inf
         self._over = np.zeros(num_envs, np.bool_)
-        self._observed: list[Any] = [None] * num_envs
 
     def world(self, number: int) -> World:
         """The world of the present episode of a car."""
@@ -130,7 +145,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         """Begin an episode of each car, or of those of `options["reset_mask"]` (N,) bool. The other
         options are those of a single environment; each is a number, a list with one for each car,
         or a range (least, greatest)."""
-        given = dict(options or {})
+        if self.closed:
+            raise UserError("this environment is closed; make a new one")
+        given = reset_options(options)
         chosen = self._mask(given.pop(MASK, None))
         seeds = self._seeds(seed)
         starts = self._starts(given)
@@ -178,16 +195,11 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         """`render_view` (H, W, 3) of each car with `render_mode="rgb_array"`, else Nones."""
         if self.render_mode is None:
             return (None,) * self.num_envs
-        view = self._render_view
-        return tuple(
-            renderer.render(self.world(number), (view,))[view]
-            for number, renderer in enumerate(self._renderers)
-        )
+        return self._observer.frames()
 
     def close_extras(self, **kwargs: Any) -> None:
         self._rngs = []
-        for renderer in self._renderers:
-            renderer.close()
+        self._observer.close()
         self._cars.close()
 
     def __getstate__(self) -> Any:
@@ -199,25 +211,15 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def _reset(self, number: int, start: Mapping[str, Any]) -> None:
         with naming_car(number, self.num_envs):
             episode = self._cars.reset(number, self._rngs[number], start)
-        self._observers[number].restart(episode)
-        self._renderers[number].change_road(self.world(number).road)
+        self._observer.restart(number, episode)
 
     def _observe(self, chosen: NDArray[np.bool_]) -> Any:
         """The observations of all cars; those of the `chosen` ones are new."""
-        batched = self._observers[0].batched
-        if batched and not isinstance(self.single_observation_space, gym.spaces.Dict):
-            return self._cars.states.copy()
-        if batched:
-            parts: dict[str, NDArray[Any]] = {STATE: self._cars.states.copy()}
-            for sensor in self._observers[0].suite.sensors:
-                parts[sensor.name] = sensor.limit(self._cars.beams).astype(sensor.dtype)
-            return parts
-        for number in np.flatnonzero(chosen).tolist():
-            state = self._cars.states[number].copy()
-            self._observed[number] = self._observers[number].observe(self.world(number), state)
-        space = self.single_observation_space
-        empty: Any = create_empty_array(space, self.num_envs)
-        return concatenate(space, self._observed, empty)
+        try:
+            return self._observer.observe(chosen)
+        except BaseException:  # the cars have moved, but nothing has been returned
+            self._rngs = []
+            raise
 
     def _info(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
         return vector_info(self._cars, self._frequency_hz, chosen)
@@ -265,27 +267,31 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + number for number in range(self.num_envs)]
+        if not isinstance(seed, list | tuple | np.ndarray):
+            return [check_whole("seed", seed) + number for number in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise UserError(
                 f"seed is a list of {len(seed)} for {self.num_envs} cars; give one for each, or "
                 "one whole number"
             )
-        return list(seed)
+        seeds = []
+        for number, own in enumerate(seed):
+            with naming_car(number, self.num_envs):
+                seeds.append(None if own is None else check_whole("seed", own))
+        return seeds
 
     def _starts(self, given: dict[str, Any]) -> list[dict[str, Any]]:
         listed, shared = _lists(given, self.num_envs)
         return [shared | own for own in _of_each_car(listed, self.num_envs)]
 
 
-def _drives(drive: DriveOptions, listed: dict[str, list[Any]], count: int) -> list[DriveOptions]:
-    """The options of each car."""
-    drives = []
+def _with_lists(shared: Options, listed: dict[str, list[Any]], count: int) -> list[Options]:
+    """The options of each car: `shared`, with its own entry of each list."""
+    options = []
     for number, own in enumerate(_of_each_car(listed, count)):
         with naming_car(number, count):
-            drives.append(replace(drive, **own) if own else drive)
-    return drives
+            options.append(replace(shared, **own) if own else shared)
+    return options
 
 
 def _of_each_car(listed: dict[str, list[Any]], count: int) -> list[dict[str, Any]]:
@@ -308,6 +314,21 @@ def _lists(given: dict[str, Any], count: int) -> tuple[dict[str, list[Any]], dic
             )
         listed[name] = value
     return listed, shared
+
+
+class DriverViewVector(LateralControlVector):
+    """`num_envs` cars, each as in an environment `DriverView` of its own."""
+
+    kind: ClassVar[Kind] = "dict"
+
+
+def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError:
+        raise UserError(
+            f"autoreset_mode is {given!r}; choose NextStep, SameStep or Disabled"
+        ) from None
 
 
 def _default_threads(count: int) -> int:

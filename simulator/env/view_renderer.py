@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.bounds import check_whole
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState
 from simulator.world.world import World
@@ -39,12 +40,16 @@ class RenderOptions:
     def __post_init__(self) -> None:
         from simulator.camera import VIEWS, check_light, check_size
 
-        check_size(self.width, self.height)
+        check_size(check_whole("width", self.width), check_whole("height", self.height))
+        check_whole("light_seed", self.light_seed)
         check_light(self.light)
         if self.render_view not in VIEWS:
             raise UserError(
                 f"render_view is {self.render_view!r}; the views are {', '.join(VIEWS)}"
             )
+
+        if self.mount is not None and not isinstance(self.mount, CameraParameters):
+            raise UserError(f"mount is {self.mount!r}; give a CameraParameters, or None")
 
     @property
     def camera(self) -> CameraParameters:
@@ -53,12 +58,30 @@ class RenderOptions:
             return mount.resized(self.width, self.height)
         return replace(mount, width=self.width, height=self.height)
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(height, width, 3) of an image in colour."""
+        return self.height, self.width, 3
+
+    def space(self, view: str) -> gym.spaces.Box:
+        """The observation space of `view`. Raises UserError for an unknown view."""
+        from simulator.camera.core.optics import FAR_M
+        from simulator.camera.core.render_modes import CLASS, CLASSES, DEPTH, ViewRequest
+
+        size = (self.height, self.width)
+        kind = ViewRequest.of(view).kind
+        if kind == DEPTH:
+            return gym.spaces.Box(0.0, FAR_M, size, np.float32)
+        if kind == CLASS:
+            return gym.spaces.Box(0, len(CLASSES) - 1, size, np.uint8)
+        return gym.spaces.Box(0, 255, self.shape, np.uint8)
+
 
 class ViewRenderer:
     """Renders views of a world by name, each at most once per state."""
 
     def __init__(self, road: Road, options: RenderOptions) -> None:
-        self._road, self._options = road, options
+        self._road, self.options = road, options
         self._camera: Camera | None = None
         self._rendered_state: CarState | None = None
         self._images: dict[str, NDArray[Any]] = {}
@@ -68,24 +91,6 @@ class ViewRenderer:
         if road is not self._road:
             self.close()
             self._road = road
-
-    def space(self, view: str) -> gym.spaces.Box:
-        """The observation space of `view`. Raises UserError for an unknown view."""
-        from simulator.camera.core.optics import FAR_M
-        from simulator.camera.core.render_modes import CLASS, CLASSES, DEPTH, ViewRequest
-
-        height, width, _ = self.shape
-        kind = ViewRequest.of(view).kind
-        if kind == DEPTH:
-            return gym.spaces.Box(0.0, FAR_M, (height, width), np.float32)
-        if kind == CLASS:
-            return gym.spaces.Box(0, len(CLASSES) - 1, (height, width), np.uint8)
-        return gym.spaces.Box(0, 255, self.shape, np.uint8)
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(height, width, 3) of an image in colour."""
-        return self._options.height, self._options.width, 3
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Copies of the views of the current state, in the order of `views`.
@@ -101,13 +106,12 @@ class ViewRenderer:
         return {view: self._images[view].copy() for view in views}
 
     def _render_missing(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
-        from simulator.camera.core.optics import FAR_M
+        from simulator.camera.core.render_modes import bounded
 
-        images = self.camera.render_views(world.body_pose(), world.traffic.poses(), views)
-        for image in images.values():
-            if image.dtype == np.float32:
-                np.minimum(image, FAR_M, out=image)
-        return images
+        images = self.camera.render_views(
+            world.body_pose(), world.traffic.poses(), views, near_s=world.state.s
+        )
+        return {view: bounded(image) for view, image in images.items()}
 
     def calibration(self, views: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """`intrinsics` (3, 3) in pixels, and by each view's name its extrinsics (4, 4), from the
@@ -115,7 +119,7 @@ class ViewRenderer:
         from simulator.camera.core.optics import extrinsics
         from simulator.camera.core.render_modes import ViewRequest
 
-        camera = self._options.camera
+        camera = self.options.camera
         at_rest = np.zeros(6)
         by_view = {view: extrinsics(camera, at_rest, ViewRequest.of(view).view) for view in views}
         return {"intrinsics": camera.intrinsics()} | by_view
@@ -126,7 +130,7 @@ class ViewRenderer:
         if self._camera is None:
             from simulator.camera import open_camera  # loads the renderer only when it is needed
 
-            options = self._options
+            options = self.options
             self._camera = open_camera(
                 self._road, options.camera, light=options.light, seed=options.light_seed
             )

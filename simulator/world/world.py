@@ -139,16 +139,7 @@ class World:
             raise UserError("this world is closed; make a new one")
         start = -START_BEFORE_LINE_M if s is None else float(s)
         check_seed(seed)
-        for name, value in (("s", start), ("to_middle", to_middle), ("angle", angle)):
-            if not math.isfinite(value):
-                raise UserError(f"reset got {name} = {value}; give a finite number")
-        if not abs(speed) <= MAX_START_SPEED_M_S:  # true for NaN, too
-            raise UserError(f"reset got speed = {speed}; give m/s between -150 and 150")
-        if abs(to_middle) > self.road.edge:
-            raise UserError(
-                f"reset got to_middle = {to_middle} m; the road ends {self.road.edge:.2f} m from "
-                "its centre, so give less"
-            )
+        check_place(self.road, start, to_middle, angle, speed)
         if self._traffic_count:
             self.traffic = Traffic(
                 self.road, self._traffic_count, np.random.default_rng([seed, 1]), ego_s=start
@@ -315,6 +306,22 @@ class World:
             collision=COLLISIONS[int(row[TOUCHED])],
             off_track=abs(track[TRACK_OFFSET]) > self.road.edge,
             backwards=abs(track[ANGLE]) > 0.5 * math.pi or track[TRACK_SPEED] < BACKWARDS_SPEED_M_S,
+        )
+
+
+def check_place(
+    road: Road, s: float = 0.0, to_middle: float = 0.0, angle: float = 0.0, speed: float = 0.0
+) -> None:
+    """Raises UserError unless a drive can start there; the arguments are those of `World.reset`."""
+    for name, value in (("s", s), ("to_middle", to_middle), ("angle", angle)):
+        if not math.isfinite(value):
+            raise UserError(f"reset got {name} = {value}; give a finite number")
+    if not abs(speed) <= MAX_START_SPEED_M_S:  # true for NaN, too
+        raise UserError(f"reset got speed = {speed}; give m/s between -150 and 150")
+    if abs(to_middle) > road.edge:
+        raise UserError(
+            f"reset got to_middle = {to_middle} m; the road ends {road.edge:.2f} m from its "
+            "centre, so give less"
         )
 
 

@@ -106,6 +106,20 @@ def test_an_unknown_parameter_or_value_is_refused() -> None:
         make_controller("torcs", LOOP, {"gain": 1.0})
 
 
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("lqr", {"offset": 1e300}),
+        ("lqr-paper", {"rho": 0.0}),
+        ("lqr-kalman", {"wheel_rate": 1e300}),
+        ("lqr-kalman", dict.fromkeys(CONTROLLERS["lqr-kalman"].tunable, 0.0)),
+    ],
+)
+def test_parameters_without_gains_are_refused(name: str, parameters: dict[str, float]) -> None:
+    with pytest.raises(UserError, match=rf"^{name}: there are no gains for .*; usual limits are"):
+        make_controller(name, LOOP, parameters)
+
+
 @pytest.mark.parametrize("name", ["pid", "LQR", ""])
 def test_an_unknown_controller_is_refused_with_the_known_names(name: str) -> None:
     with pytest.raises(UserError, match=f"no controller '{name}'; use one of: lqr, lqr-preview"):

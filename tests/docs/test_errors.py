@@ -39,7 +39,7 @@ from runtime.camera_file import read_camera
 from serve.cameras import read_cameras
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.turns import Turns
-from simulator.env.vector import LateralControlVector
+from simulator.env.vector import DriverViewVector, LateralControlVector
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.track.torcs.torcs import read_torcs
@@ -326,6 +326,13 @@ def _(folder: Path) -> object:
 @row("a list with more or fewer entries than a vector has cars")
 def _(folder: Path) -> object:
     return LateralControlVector(3, track=["oval", "town"])
+
+
+@row("a process that draws")
+def _(folder: Path) -> object:
+    cars = DriverViewVector(1, track="oval")
+    with mock.patch("simulator.camera.workers.pool.MODULE", "simulator.no_such_module"):
+        return cars.reset(seed=0)
 
 
 @row("EGL is missing")

@@ -161,6 +161,8 @@ class Camera:
         body_pose: ArrayLike,
         others: ArrayLike | None = None,
         views: Sequence[str] = ("front",),
+        *,
+        near_s: float | None = None,
     ) -> dict[str, Picture]:
         """Pictures of several views from one pose, by the names in `views`.
 
@@ -168,9 +170,12 @@ class Camera:
         distance along the optical axis (height, width) float32 in metres, inf in the sky;
         "front:class" the index into CLASSES (height, width) uint8. Depth and class belong to the
         surface at the pixel's centre; leaves and hedges count where they are more than half
-        opaque. All kinds of one view share one culling pass. Raises UserError for an unknown view
-        or kind.
+        opaque. All kinds of one view share one culling pass. `near_s`: distance (m) along the road
+        near which the car is, which tells a bridge from the road below; None: that of the last
+        picture. Raises UserError for an unknown view or kind.
         """
+        if near_s is not None:
+            self._last_s = near_s
         return self._views(body_pose, others, {name: ViewRequest.of(name) for name in views})
 
     def _views(

@@ -1,9 +1,12 @@
 """Kinds of image of a view: colour, or the depth or class of each pixel."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
-from simulator.camera.core.optics import VIEWS
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.camera.core.optics import FAR_M, VIEWS
 from trackfeatures.errors import UserError
 
 CLASSES: tuple[str, ...] = ("road", "marking", "car", "ground", "sky", "object")
@@ -34,3 +37,8 @@ class ViewRequest:
                 f"the kinds are {', '.join(PICTURE_KINDS)}"
             )
         return cls(view, kind or COLOUR)
+
+
+def bounded(picture: NDArray[Any]) -> NDArray[Any]:
+    """`picture`; the depth of the sky, if it is one of depth, is FAR_M instead of infinity."""
+    return np.minimum(picture, FAR_M, out=picture) if picture.dtype == np.float32 else picture

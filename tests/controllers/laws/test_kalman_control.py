@@ -1,5 +1,8 @@
 """LQR and MPC on an estimated state: the gain's closed form, drives with noise and delay."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,10 +10,12 @@ from controllers.drive.closed_loop import DriveResult
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.run import drive
-from controllers.interface import Observation
+from controllers.interface import LoopConfig, Observation
 from controllers.laws.kalman import CAR, StateEstimate, Vector
 from controllers.laws.kalman_control import smooth_gain
 from controllers.laws.lqr_gains import LqrWeights, discrete_gain
+from controllers.registry import make_controller
+from trackfeatures import RoadClass
 
 STEPS = 900
 ESTIMATED = ("lqr-kalman", "mpc-kalman")
@@ -75,3 +80,17 @@ def test_a_drive_on_images_knows_that_its_answers_are_predicted_to_the_present(
     assert known == [True, True]
     drive(config, disturbance=DISTURBANCES["noise"])
     assert known == [True, True, False, False]
+
+
+@pytest.mark.parametrize("name", ["to_lane_centre", "angle", "vx", "vy", "yaw_rate"])
+@pytest.mark.parametrize("controller", ESTIMATED)
+def test_one_measurement_that_is_not_finite_does_not_stay_in_the_filter(
+    controller: str, name: str
+) -> None:
+    good = Observation(0.3, 0.01, RoadClass.STRAIGHT, vx=15.0, vy=0.0, yaw_rate=0.0)
+    steered = []
+    for bad in (good, replace(good, **{name: math.nan}), replace(good, **{name: -math.inf})):
+        law = make_controller(controller, LoopConfig(dt=0.05, noisy=True))
+        steered.append([law.update(bad if k == 10 else good) for k in range(16)])
+    assert max(map(abs, steered[0])) > 0.01
+    np.testing.assert_array_equal(steered[1:], [steered[0]] * 2)

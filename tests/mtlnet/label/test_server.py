@@ -1,12 +1,15 @@
 """The label page's interface: drag, save, undo, and refused requests."""
 
+import os
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from mtlnet.data.custom_images import open_custom_images
-from mtlnet.data.labels_file import read_labels
+from mtlnet.data.labels_file import read_cells, read_labels
+from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import marking_pixels
 from tests.mtlnet.label.conftest import TRUE, Site
@@ -155,3 +158,28 @@ def test_a_folder_without_a_camera_is_refused(pictures: Path) -> None:
     (pictures / "none").mkdir()
     with pytest.raises(UserError, match="there is no picture in"):
         LabelFolder(pictures / "none", None, CameraParameters())
+
+
+def test_a_drag_neither_decodes_the_picture_nor_reads_the_labels_again(site: Site) -> None:
+    site.ask("PUT", "/api/pictures/0/label", LABEL)
+    left, right = (each.tolist() for each in marking_pixels(VIEW, TRUE, [6.0, 25.0]))
+    with (
+        mock.patch("mtlnet.label.folder.read_whole_image", side_effect=read_whole_image) as decode,
+        mock.patch("mtlnet.label.folder.read_cells", side_effect=read_cells) as read,
+    ):
+        site.ask("GET", "/api/pictures/1")
+        site.ask("GET", "/api/pictures/1/image")
+        for _ in range(3):
+            site.ask("POST", "/api/pictures/1/fit", {"left": left, "right": right})
+        assert (decode.call_count, read.call_count) == (1, 1)
+        site.ask("GET", "/api/pictures/0")
+        assert (decode.call_count, read.call_count) == (2, 1)
+        table = site.folder / "labels.csv"
+        before = table.stat()
+        table.write_text(table.read_text().replace("-1.500", "-1.400"))  # same size, same time
+        os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+        _, shown, _ = site.ask("GET", "/api/pictures/0")
+        assert shown["markings"]["ml"] == pytest.approx(-1.4)
+        (site.folder / "1.png").unlink()
+        status, told, _ = site.ask("GET", "/api/pictures/0")
+        assert (status, "1.png cannot be read" in told["detail"]) == (422, True)

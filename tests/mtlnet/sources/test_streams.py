@@ -150,10 +150,17 @@ def test_ctrl_c_ends_a_stream_and_keeps_its_answers(engine: BrightnessEngine, ad
         ("63", "webcam 63 cannot be opened; the cameras of this machine are"),
     ],
 )
-def test_what_cannot_be_opened_is_told(engine: BrightnessEngine, given: str, message: str) -> None:
+def test_what_cannot_be_opened_is_told_once_and_leaves_earlier_answers(
+    engine: BrightnessEngine, tmp_path: Path, given: str, message: str
+) -> None:
+    earlier = tmp_path / "answers.csv"
+    earlier.write_text("yesterday")
+    notes: list[str] = []
     with pytest.raises(UserError, match=message) as raised:
-        predict_files(engine, [given])
+        predict_files(engine, [given], [earlier], note=notes.append)
     assert "secret" not in str(raised.value)
+    assert notes == []
+    assert earlier.read_text() == "yesterday"
 
 
 def test_a_file_comes_before_a_webcam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

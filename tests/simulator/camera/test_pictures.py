@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from simulator.camera.scene.cars import WIDTH_M
 from simulator.camera.snapshot import standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
+from tests.simulator.track.track_samples import figure_of_eight
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -251,3 +253,17 @@ def test_a_track_of_unknown_look_gets_a_countryside(road: Road) -> None:
     strange = Road(replace(road.track, look="moon"), 1)
     with Camera(strange, seed=1, light=light()) as camera:
         assert camera.render(standing_pose(strange, 10.0, 0.0)).std() > 8.0
+
+
+def test_where_the_road_crosses_itself_the_given_place_counts_not_the_picture_before() -> None:
+    track = figure_of_eight()
+    camera = Camera.__new__(Camera)  # without a scene
+    camera.road = Road(track)
+    upper = 0.5 * track.length_m
+    for before in (5.0, upper + 5.0):
+        for near in (5.0, upper + 5.0):
+            camera._last_s = before
+            with mock.patch.object(Camera, "_views", return_value={}):
+                camera.render_views(np.zeros(6), near_s=near)
+            x, y = (float(value) for value in (track.at(near).x, track.at(near).y))
+            assert camera._s_of(0.05 * x, 0.05 * y) == pytest.approx(near, abs=5.0)

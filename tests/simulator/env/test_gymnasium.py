@@ -218,6 +218,12 @@ def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
         ({"s": math.inf}, "give a finite number"),
         ({1: 2.0}, "unknown options"),
         ({"velocity": 3.0}, "velocity"),
+        ({"speed": (5.0, 1.0)}, r"speed is \(5.0, 1.0\); give a finite number, or a range"),
+        ({"speed": (1.0, 2.0, 3.0)}, "give a finite number, or a range"),
+        ({"s": (0.0, math.inf)}, "give a finite number, or a range"),
+        ({"angle": ()}, "give a finite number, or a range"),
+        ({"to_middle": (0.0, edge + 1.0)}, "the road ends"),
+        ([1, 2], r"options is \[1, 2\]; give a dict"),  # type: ignore[list-item]
     ]
     for bad, message in refused:
         with pytest.raises(UserError, match=message):
@@ -257,6 +263,24 @@ def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
         ({"sensors": ("v_x", "v_x")}, "share a name"),
         ({"sensors": ("v_x",), "sensor_noise": {"v_y": 1.0}}, "noise is set for"),
         ({"sensors": (Sensor("state", "", lambda world: 0.0),)}, "named like"),
+        ({"track": None}, "track is None; give a name"),
+        ({"track": ("oval", "town")}, "track is ('oval', 'town')"),
+        ({"lanes": [1, 2]}, "a road of [1, 2] lanes"),
+        ({"lanes": (1.5, 3)}, "a road of 1.5 lanes"),
+        ({"lane_width": "wide"}, "lane_width is 'wide'; give a finite number"),
+        ({"road_seed": -1}, "road_seed is -1; give a whole number of 0 or more"),
+        ({"start": None}, "start is None; give a dict"),
+        ({"frequency_hz": 0}, "frequency_hz is 0; give a whole number of 1 or more"),
+        ({"frequency_hz": "20"}, "frequency_hz is '20'"),
+        ({"controls": ["steer"]}, "controls is ['steer']"),
+        ({"noise": [0.1]}, "noise is [0.1]; give a standard deviation"),
+        ({"sensors": 3}, "sensors is 3; give a list"),
+        ({"sensor_noise": 0.1}, "sensor_noise is 0.1; give a dict"),
+        ({"ends": None}, "ends is None; give a list"),
+        ({"lambda_": "1"}, "lambda_ is '1'; give a finite weight"),
+        ({"height": 48.5}, "height is 48.5; give a whole number"),
+        ({"light_seed": -1}, "light_seed is -1; give a whole number of 0 or more"),
+        ({"mount": "roof"}, "mount is 'roof'; give a CameraParameters"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:

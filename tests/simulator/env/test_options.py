@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import gymnasium as gym
@@ -265,4 +266,15 @@ def test_gymnasium_render_wrappers_return_the_images() -> None:
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
     observed, _ = AddRenderObservation(env, render_only=True).reset(seed=0)
     np.testing.assert_array_equal(observed, frames[0])
+    env.close()
+
+
+def test_the_place_of_a_picture_is_that_of_the_car_not_of_the_picture_before() -> None:
+    """On a road that crosses itself, the camera tells by it where the car is."""
+    env = gym.make(IMAGE_ID, track="oval", disable_env_checker=True, **SMALL)
+    camera = mock.Mock()
+    camera.render_views.return_value = {"front": np.zeros((48, 64, 3), np.uint8)}
+    with mock.patch("simulator.camera.open_camera", return_value=camera):
+        _, info = env.reset(seed=0, options={"s": 300.0})
+    assert camera.render_views.call_args.kwargs == {"near_s": info["s"]}
     env.close()

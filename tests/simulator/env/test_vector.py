@@ -223,6 +223,13 @@ def test_less_grip_lengthens_the_way_to_stop() -> None:
         ({"lane_width": (2.0, 4.0)}, "^lane width 2.0 m is out of range"),
         ({"traffic": [0, 0, 50]}, "^car 2: 50 traffic cars"),
         ({"threads": 0}, "^threads is 0"),
+        ({"threads": True}, "^threads is True"),
+        ({"autoreset_mode": "Never"}, "^autoreset_mode is 'Never'; choose NextStep, SameStep or"),
+        ({"max_episode_steps": 0}, "^max_episode_steps is 0; give a whole number of 1 or more"),
+        ({"max_episode_steps": 2.5}, "^max_episode_steps is 2.5"),
+        ({"track": ["oval", None, "town"]}, "^car 1: track is None"),
+        ({"start": [{}, {}, None]}, "^car 2: start is None; give a dict"),
+        ({"copy": "no"}, "^copy is 'no'; give True or False"),
         ({"trafic": 3}, "did you mean 'traffic'"),
         ({"frequency_hz": 30}, "30 Hz"),
     ],
@@ -230,6 +237,12 @@ def test_less_grip_lengthens_the_way_to_stop() -> None:
 def test_bad_options_name_the_car(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         make_vector(3, **options)
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.0, True, "3", None])
+def test_bad_numbers_of_cars_are_refused(count: Any) -> None:
+    with pytest.raises(UserError, match=r"^num_envs is .*; give a whole number of 1 or more"):
+        make_vector(count)
 
 
 @pytest.mark.parametrize(
@@ -272,13 +285,26 @@ def test_bad_resets_name_the_car_and_reset_none() -> None:
         ({"options": {"reset_mask": np.zeros(3, bool)}}, "at least one of them True"),
         ({"options": {"reset_mask": np.ones(2, bool)}}, "array of 3 truth values"),
         ({"seed": [1, 2]}, "^seed is a list of 2 for 3 cars"),
+        ({"seed": [1, 2, -3]}, "^car 2: seed is -3; give a whole number of 0 or more"),
+        ({"seed": -1}, "^seed is -1"),
+        ({"seed": 1.5}, "^seed is 1.5"),
+        ({"seed": "abc"}, "^seed is 'abc'"),
+        ({"options": [1]}, r"^options is \[1\]; give a dict"),
+        ({"options": {"to_middle": [0.0, 0.0, 50.0]}}, "^car 2: reset got to_middle = 50.0 m"),
+        ({"options": {"to_middle": [0.0, (0.0, 50.0), 0.0]}}, "^car 1: reset got to_middle = 50"),
+        ({"options": {"speed": [0.0, (5.0, 1.0), 0.0]}}, r"^car 1: speed is \(5.0, 1.0\); give"),
+        ({"options": {"angle": [0.0, 0.0, np.nan]}}, "^car 2: reset got angle = nan"),
     ]
     for arguments, message in refused:
         with pytest.raises(UserError, match=message):
             vector.reset(**arguments)
     *_, after = vector.step(np.zeros((3, 1)))
     np.testing.assert_array_equal(after["steps"], before["steps"] + 1)
+    counted, listed = (vector.reset(seed=each)[1]["score"] for each in (np.arange(3), [0, 1, 2]))
+    np.testing.assert_array_equal(counted, listed)
     vector.close()
+    with pytest.raises(UserError, match=r"^this environment is closed; make a new one"):
+        vector.reset(seed=0)
     with pytest.raises(gym.error.ResetNeeded):
         vector.step(np.zeros((3, 1)))
 

@@ -1,0 +1,1 @@
+"""Processes that draw the pictures of many cars into shared memory."""

@@ -1,0 +1,130 @@
+"""A process that draws pictures of cars into shared memory; `pool` starts it.
+
+It has the one OpenGL context of its process, and a camera for each scene of its cars.
+"""
+
+import os
+import sys
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from numpy.typing import NDArray
+
+from simulator.arrays import FloatArray
+from simulator.camera.core.camera import Camera, open_camera
+from simulator.camera.core.render_modes import bounded
+from simulator.camera.workers.shared_pictures import PictureFormat, map_pictures
+from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
+
+PARENT_CHECK_S = 2.0
+"""Interval at which an idle worker checks that its parent lives: a child forked from the parent may
+hold the connection open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenery:
+    """What a camera is built from: see `open_camera`."""
+
+    road: Road
+    light: str
+    light_seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """The picture to draw of one car: number of the scenery, pose of the body (6,), poses of other
+    cars (n, 6), and distance (m) along the road."""
+
+    car: int
+    scenery: int
+    pose: FloatArray
+    others: FloatArray
+    s: float
+
+
+@dataclass(frozen=True)
+class Setup:
+    """First message to a worker: what stays the same for its lifetime."""
+
+    cars: int
+    formats: dict[str, PictureFormat]
+    camera: CameraParameters
+    cameras: int
+    """Greatest number of cameras that it keeps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Shots to draw, each in all `views`, and the sceneries that they are the first to use."""
+
+    shots: list[Shot]
+    views: tuple[str, ...]
+    sceneries: dict[int, Scenery]
+
+
+class Cameras:
+    """The cameras of the sceneries drawn last, built by `build`; at most `most`."""
+
+    def __init__(self, most: int, build: Callable[[Scenery], Camera]) -> None:
+        self._most, self._build = most, build
+        self._sceneries: dict[int, Scenery] = {}
+        self._cameras: OrderedDict[int, Camera] = OrderedDict()
+
+    def add(self, sceneries: dict[int, Scenery]) -> None:
+        self._sceneries |= sceneries
+
+    def of(self, scenery: int) -> Camera:
+        """The camera of scenery number `scenery`."""
+        if scenery not in self._cameras:
+            while len(self._cameras) >= self._most:
+                self._cameras.popitem(last=False)[1].close()
+            self._cameras[scenery] = self._build(self._sceneries[scenery])
+        self._cameras.move_to_end(scenery)
+        return self._cameras[scenery]
+
+
+def main(connection: Connection, descriptor: int, parent: int) -> None:
+    """Draw the shots of each task, and answer each picture drawn with the number of its car, until
+    the parent has ended. A UserError is sent back, and ends the process."""
+    setup: Setup = connection.recv()
+    pictures = map_pictures(descriptor, setup.cars, setup.formats)
+    os.close(descriptor)
+    cameras = Cameras(
+        setup.cameras,
+        lambda scenery: open_camera(
+            scenery.road, setup.camera, light=scenery.light, seed=scenery.light_seed
+        ),
+    )
+    try:
+        while True:
+            while not connection.poll(PARENT_CHECK_S):
+                if os.getppid() != parent:
+                    return
+            task: Task = connection.recv()
+            cameras.add(task.sceneries)
+            for shot in task.shots:
+                draw(shot, task.views, cameras, pictures)
+                connection.send(shot.car)
+    except (EOFError, ConnectionError):
+        return  # the parent has ended or has closed the pool
+    except UserError as error:
+        connection.send(error)
+
+
+def draw(
+    shot: Shot, views: tuple[str, ...], cameras: Cameras, pictures: dict[str, NDArray[Any]]
+) -> None:
+    """Draw the views of one car into its rows of `pictures`."""
+    camera = cameras.of(shot.scenery)
+    drawn = camera.render_views(shot.pose, shot.others, views, near_s=shot.s)
+    for view, picture in drawn.items():
+        pictures[view][shot.car] = bounded(picture)
+
+
+if __name__ == "__main__":
+    main(Connection(int(sys.argv[1])), int(sys.argv[2]), int(sys.argv[3]))
