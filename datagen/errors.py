@@ -1,4 +1,4 @@
-"""Errors of collecting; those of the dataset format are in `datagen.recording.errors`."""
+"""Errors of a collection; `datagen.recording.errors` has the errors of the dataset format."""
 
 from trackfeatures.errors import UserError
 

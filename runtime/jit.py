@@ -114,7 +114,7 @@ def compiled_for_threads(function: Function) -> Function:
 
 
 def callable_from_compiled(function: Function) -> Function:
-    """Make a plain Python function callable from compiled code; outside it stays as it is."""
+    """Make a plain Python function callable from compiled code; Python code calls it unchanged."""
     return register_jitable(function)
 
 
@@ -135,14 +135,14 @@ def _borrow(typing_context: Any, array: Any) -> Any:
 
 
 borrowed: Borrow = cast(Any, intrinsic(_borrow))
-"""In compiled code: the same array without its count of references. Views of an array count up and
-down atomically, which takes longer than the arithmetic of small functions. Use it on arguments
-only: the caller holds them until the function returns."""
+"""In compiled code: the same array without reference counting. Otherwise each view of the array
+changes the reference count by atomic operations, which take longer than the arithmetic of a small
+function. Use it on arguments only: the caller holds them until the function returns."""
 
 
 def inlined(function: Function) -> Function:
-    """Like `compiled`, for a small function of a hot loop: its machine code is put into its
-    callers', which saves the passing of arrays."""
+    """Like `compiled`, for a small function of a hot loop: its machine code is copied into the code
+    of each caller, so that no arrays are passed."""
     return _compiled(function, nogil=False, forceinline=True)
 
 

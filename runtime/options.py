@@ -1,4 +1,4 @@
-"""The fields of a configuration's dataclass as the options of a command: each is declared once.
+"""Makes the fields of a configuration's dataclass options of a command: each is declared once.
 
 A field that is an option has it in its type: `size: Annotated[int, typer.Option(help="...")] = 32`.
 """
@@ -16,8 +16,9 @@ Command = Callable[..., None]
 def options_of(config: Any, *, only_given: bool = False) -> Callable[[Command], Command]:
     """Add the options of the dataclass `config` to a command, which takes a `config` first.
 
-    `only_given`: the command takes a dictionary of the options that were given instead, by field,
-    because it finds the others elsewhere; the help shows the defaults of the dataclass.
+    With `only_given` the command takes a dictionary instead: field names and values of the options
+    that the user gave. The command finds the other values elsewhere; the help shows the dataclass's
+    defaults.
     """
     types = get_type_hints(config, include_extras=True)
     added = [
@@ -47,7 +48,7 @@ def options_of(config: Any, *, only_given: bool = False) -> Callable[[Command], 
 
 
 def _parameter(field: Field[Any], type_: Any, only_given: bool) -> Parameter:
-    """The field as a parameter of a command. Text is what an option with a parser takes."""
+    """The field as a parameter of a command; an option with a parser has the type of text."""
     kind, option = get_args(type_)
     default = Parameter.empty if field.default is MISSING else field.default
     if getattr(option, "parser", None) is not None:

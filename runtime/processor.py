@@ -1,6 +1,7 @@
-"""Which number formats this processor multiplies natively; it is slow in others.
+"""Finds the number formats that this processor multiplies natively; it is slow in other formats.
 
-Read from the flags in /proc/cpuinfo, so on Linux alone; elsewhere nothing counts as native.
+They are read from the flags in /proc/cpuinfo. On systems other than Linux no format counts as
+native.
 """
 
 from functools import cache
@@ -9,8 +10,8 @@ from pathlib import Path
 CPUINFO = Path("/proc/cpuinfo")
 BF16_FLAGS = {"avx512_bf16", "amx_bf16", "bf16"}
 INT8_FLAGS = {"avx512_vnni", "avx_vnni", "avx_vnni_int8", "amx_int8", "i8mm", "asimddp"}
-"""x86: products of 8-bit numbers summed in 32 bits; without them sums of two saturate at 16 bits.
-ARM: `i8mm` and `asimddp` (dot products)."""
+"""Instructions that sum products of 8-bit numbers in 32 bits. x86: without them, sums of two
+products saturate at 16 bits. ARM: `i8mm` and `asimddp` (dot products)."""
 
 
 def has_bf16() -> bool:

@@ -127,8 +127,8 @@ def connect(
 ) -> socket.socket:
     """A connection to the first address of (host, port) that accepts, within `timeout_s` in total.
 
-    Each address gets an equal share of the remaining time, but at least CONNECT_S if so much is
-    left. Raises the first OSError. The arguments are those of `socket.create_connection`.
+    Each address gets an equal share of the remaining time, but at least CONNECT_S if that is left.
+    Raises the first OSError. The arguments are those of `socket.create_connection`.
     """
     host, port = place
     addresses = _addresses(host, port)

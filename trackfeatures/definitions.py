@@ -80,7 +80,8 @@ class TrackFeatures:
     """The track features at one time."""
 
     ml: float | None
-    """This and the next four: distances in m, negative left of the car; None if absent."""
+    """Distance to the marking in m, negative left of the car; None if it is absent. The next four
+    fields are distances of the same kind."""
     mr: float | None
     l: float | None
     m: float | None

@@ -4,7 +4,8 @@ from trackfeatures.definitions import VERSION
 
 
 class UserError(Exception):
-    """A problem that the user can fix; the message has the finding, the expectation, the remedy."""
+    """A problem that the user can fix; the message says what was seen, what was expected, what to
+    do."""
 
 
 class DefinitionsMismatch(UserError):

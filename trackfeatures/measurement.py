@@ -145,7 +145,7 @@ def on_marking_distances(
 
 
 def localise(distances: ArrayLike) -> NDArray[np.float64]:
-    """`lane_offset` (N,) in m of distances (N, 5) in m; NaN: no visible lane, absent distance."""
+    """`lane_offset` (N,) in m from distances (N, 5) in m, NaN where absent; NaN without a lane."""
     rows = np.atleast_2d(np.asarray(distances, dtype=np.float64)).tolist()
     present = ((None if math.isnan(d) else d for d in row) for row in rows)
     offsets = (lane_offset(*row) for row in present)

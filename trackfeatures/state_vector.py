@@ -1,4 +1,4 @@
-"""The paper's state vector (7,): what its controllers know of the car and of the road."""
+"""The paper's state vector (7,): the input of its controllers, which describes car and road."""
 
 import math
 

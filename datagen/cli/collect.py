@@ -172,7 +172,7 @@ def merge(
     out: Annotated[Path, typer.Option(help="Dataset folder to create or to add to.")],
     as_json: AsJson = False,
 ) -> None:
-    """Merge the rounds of shards, or of other plans, into one dataset."""
+    """Merge datasets, such as the shards of one plan, into one dataset."""
     from datagen.execution.merge import merge as run
 
     merged = run(folders, out)
@@ -186,7 +186,7 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """The numbers of --lanes. Raises UserError."""
+    """The lane counts in the text of --lanes. Raises UserError."""
     try:
         return tuple(sorted({int(part) for part in names(text)}))
     except ValueError as error:

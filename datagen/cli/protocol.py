@@ -26,10 +26,11 @@ def protocol(
     tracks_dir: TracksDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Record what the paper tests its perception on, for `mtlnet evaluate --protocol paper`.
+    """Record the test data of the paper's protocol, for `mtlnet evaluate --protocol paper`.
 
     A lap near the middle of g-track-3 and of dirt-3, in clear light and in heavy shadow, and rounds
-    on the paper's nine tracks. Needs the tracks of TORCS. The same command again continues it.
+    on the paper's nine tracks. Needs the tracks of TORCS. The same command continues an interrupted
+    recording.
     """
     from datagen.planning.class_balance import TrackForecast
     from datagen.planning.protocol import protocol_plan

@@ -158,7 +158,8 @@ class ScriptedDriver:
         return speed
 
     def _avoid_cars(self, wanted: float, state: CarState, traffic: Traffic) -> tuple[float, bool]:
-        """`wanted` (m) kept on the road and clear of cars alongside, and if it is unchanged."""
+        """`wanted` (m), limited to the road and to places clear of cars alongside; whether it is
+        unchanged."""
         low, high = -self._max_offset, self._max_offset
         length = self._road.track.length_m
         near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)

@@ -27,8 +27,8 @@ MAX_OFFSET_STEP_M = 4.5
 WOBBLE_ANGLE_RAD = 0.024
 """Standard deviation of the wobble's angle to the road."""
 MIDDLE_WOBBLE = 0.5
-"""Share of it on MIDDLE: the mean distance to the middle is then 0.17 m; the paper's vehicles drive
-at 0.148 and 0.175 m on their images."""
+"""Factor on the wobble for the trajectory MIDDLE: the mean distance to the middle is then 0.17 m.
+The paper's vehicles drive at 0.148 and 0.175 m on their images."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Course:
 
 
 def max_offset(road: Road) -> float:
-    """Farthest (m) from the centre of the track that a course may lead."""
+    """Largest distance (m) of a course from the centre of the track."""
     return min(
         road.lanes * road.lane_width / 2 + OUTSIDE_M,
         road.edge - EDGE_CLEARANCE_M,
@@ -88,7 +88,7 @@ def _lane(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray,
 
 
 def _middle(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """The centre of the middle lane: as the paper's vehicle drives. Only the wobble leaves it."""
+    """The centre of the middle lane, as the paper's vehicle drives; only the wobble is added."""
     return np.full(count, tf.lane_centre(road.lanes // 2, road.lanes, road.lane_width)), 1.0
 
 

@@ -32,8 +32,8 @@ class ProgressCallback(Protocol):
 class CollectResult:
     """Result of a collection: `rounds` and `frames` in the folder, `recorded_frames` in this run.
 
-    `content_hash` is the dataset's (see `datagen.recording.dataset`); None while other shards of
-    the plan are missing.
+    `content_hash` is the hash of the dataset (see `datagen.recording.dataset`); None while other
+    shards of the plan are missing.
     """
 
     rounds: int

@@ -19,7 +19,8 @@ class Timeouts:
     """Time limits in s, measured with the monotonic clock."""
 
     heartbeat_s: float = 300.0
-    """A process is stopped as hanging after this long without a message. Compiling sends none."""
+    """A process that sends no message for this time counts as hanging and is stopped. It sends no
+    messages while it compiles."""
     round_start_s: float = 600.0
     frame_s: float = 1.0
     """A round may take `round_start_s` plus this time for each frame."""

@@ -1,4 +1,4 @@
-"""A dataset as a LeRobotDataset v3.0: one episode a round, images embedded in parquet files.
+"""A dataset as a LeRobotDataset v3.0: one episode per round, images embedded in parquet files.
 
 Read it with LeRobotDataset("driverview/data", root=OUT). Image bytes are copied as recorded.
 Episodes are in the order train, test; `splits` in meta/info.json has the episodes of each side.

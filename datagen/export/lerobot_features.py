@@ -76,7 +76,7 @@ def _row(step: Step) -> dict[str, Any]:
 
 
 def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
-    """Rows of an episode for the files in data/."""
+    """The rows of an episode, as a table for the files in data/."""
     images = pa.StructArray.from_arrays(
         [
             pa.array([bytes(step.image) for step in steps], pa.binary()),

@@ -17,7 +17,7 @@ FORMATS = ("webdataset", "lerobot")
 
 @dataclass(frozen=True, slots=True)
 class ExportConfig:
-    """Options of `datagen export`, which has their defaults."""
+    """Options of `datagen export`; the command declares their defaults."""
 
     format: str
     split: str
@@ -25,7 +25,7 @@ class ExportConfig:
     shuffle: bool
 
     def validate(self) -> None:
-        """Raise UserError for options that cannot be met, before anything is read."""
+        """Raise UserError for impossible options, before anything is read."""
         if self.format not in FORMATS:
             raise UserError(f"there is no format {self.format!r}; choose {' or '.join(FORMATS)}")
         if self.shard_size < 1:
@@ -41,7 +41,7 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """Result of an export; `content_hash` is that of the source dataset."""
+    """Result of an export; `content_hash` is the hash of the source dataset."""
 
     format: str
     out: str

@@ -1,4 +1,4 @@
-"""A dataset as WebDataset shards: `train-000000.tar` and so on, two files a frame.
+"""A dataset as WebDataset shards: `train-000000.tar` and so on, two files per frame.
 
 KEY.jpg is the recorded image, byte for byte (KEY.png in lossless rounds), KEY.json the truth of the
 frame; `sample.schema.json` beside the shards describes unit, frame and meaning of each value.
@@ -85,7 +85,7 @@ def _add(shard: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def sample_schema() -> dict[str, Any]:
-    """JSON schema of KEY.json: that of the messages, with null for absent fields."""
+    """JSON schema of KEY.json: the schema of the recorded messages, with null for absent fields."""
     recorded = json_schema()
     text, count = {"type": "string"}, {"type": "integer", "minimum": 0}
     parts = {

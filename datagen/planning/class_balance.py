@@ -35,7 +35,7 @@ TARGET_SHARE = 0.19
 START_CANDIDATES = 48
 """Number of starts tried for each round, evenly around the lap."""
 MIN_GAIN = 1e-4
-"""Smallest gain in share, times the number of rounds, for which a start is changed."""
+"""A start is changed only for a gain in share of at least this, divided by the number of rounds."""
 
 
 class Forecast(Protocol):
@@ -99,7 +99,8 @@ class TrackForecast:
 
 
 def expected_speed(entry: RoundPlan) -> float:
-    """Speed on a straight, m/s; on one lane, the slowest car's, which cannot be overtaken."""
+    """Speed on a straight, m/s. On one lane it is the slowest car's speed, as nobody can
+    overtake."""
     speed = entry.speed_kmh
     if entry.lanes == 1 and entry.traffic:
         low, high = DESIRED_KMH
@@ -144,5 +145,5 @@ def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int,
 
 
 def _missing_share(shares: FloatArray) -> FloatArray:
-    """Sum over the classes of each one's shortfall from `TARGET_SHARE`; `shares` (..., 3)."""
+    """Sum over the classes of the shortfall from `TARGET_SHARE`; `shares` (..., 3)."""
     return np.asarray(np.maximum(TARGET_SHARE - shares, 0.0).sum(axis=-1))

@@ -61,7 +61,7 @@ class RoundPlan:
     """The dataset's camera; `camera` may be a jittered copy of it."""
     lane_width_m: float = tf.LANE_WIDTH_M
     varied: VariedRound | None = None
-    """The drawn values of a varied road; None on the paper's roads."""
+    """The random values of a varied road; None on the paper's roads."""
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of `plan.json`; paper's roads have no key `varied`, as in earlier versions."""

@@ -123,7 +123,7 @@ def _cameras(config: CollectConfig, rng: np.random.Generator) -> list[CameraPara
 def _roads(
     config: CollectConfig, lanes: Sequence[int], lights: Sequence[tuple[str, ...]]
 ) -> list[VariedRound | None]:
-    """The drawn values of each round's road, from the round's seed; None on the paper's roads."""
+    """The random values of each round's road, from the round's seed; None on the paper's roads."""
     if config.roads == "paper":
         return [None] * config.rounds
     first, height_m = _first_seed(config), config.camera.height_above_road_m

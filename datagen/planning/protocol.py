@@ -1,4 +1,4 @@
-"""The plan of the paper's protocol (Li et al., section VII): what its perception is tested on.
+"""The plan of the paper's protocol (Li et al., section VII): the test data of its perception.
 
 Four laps near the middle of a one-lane road at 20 Hz, on g-track-3 and on dirt-3, in clear light
 and in heavy shadow, without traffic; and rounds on its nine tracks with one, two and three lanes,
@@ -54,7 +54,7 @@ def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
 def _drive(
     like: RoundPlan, track: str, light: str, seed: int, laps: float, tracks_dir: Path | None
 ) -> RoundPlan:
-    """A drive of so many laps from the line on; what is not of a drive is that of `like`."""
+    """A drive of `laps` laps from the start line; its other values are those of `like`."""
     geometry = find_track(track, tracks_dir)
     profile = speed_profile(geometry, SPEED_KMH / 3.6, innermost_y=0.0)
     lap_s = float((profile.cell_m / profile.limit).sum())

@@ -121,7 +121,7 @@ class Frames:
     def read_batch(
         self, indices: Sequence[int] | NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, one thread a core.
+        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, one thread per core.
 
         Returns `out`, a new array if none is given. Raises IndexError for a frame that does not
         exist, UndecodableImage for a damaged image (the rest of `out` is then undefined), and
@@ -148,7 +148,8 @@ class Frames:
     def _decode(
         self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]
     ) -> tuple[int, UndecodableImage] | None:
-        """Decode until `rows` ends or an image is damaged; return the row and error of that one."""
+        """Decode until `rows` ends or an image is damaged; return the damaged image's row and
+        error."""
         for row, i in rows:
             try:
                 decode_into(self.jpeg(i), out[row])

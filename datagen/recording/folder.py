@@ -76,8 +76,7 @@ def prepare(folder: Path) -> None:
 def is_unstarted(folder: Path, first_file: str) -> bool:
     """Whether `folder` holds at most empty parts of a dataset and an unfinished `first_file`.
 
-    That is what a disk that was full from the start leaves; `first_file` is written before all
-    others.
+    A collection leaves this if the disk was full from the start: it writes `first_file` first.
     """
     return all(
         path.name in (unfinished_path(folder / first_file).name, LOCKS)
@@ -118,7 +117,7 @@ def state_path(folder: Path, round_id: str) -> Path:
 def _partial_home(folder: Path, round_id: str) -> Path:
     """The folder of an unfinished round. Raises BadName, or DatasetError for a link.
 
-    What lies in it is deleted, so it must not lead out of the dataset.
+    Its content is deleted, so it must not lead out of the dataset.
     """
     home = folder / PARTIAL / require_name(round_id, "round id")
     if home.parent.is_symlink():

@@ -29,7 +29,7 @@ def summarize_lights(lights: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RoundHeader:
-    """The parameters of a round, known before its first frame: `driverview.round`."""
+    """The record `driverview.round`: the parameters of a round, known before its first frame."""
 
     id: str
     seed: int
@@ -55,7 +55,7 @@ class RoundHeader:
     """The camera of the dataset, if `camera` differs from it: by jitter, or by the height of a
     varied road."""
     varied: dict[str, Any] | None = None
-    """The drawn values of a round of `--roads varied`; None on the paper's roads."""
+    """The random values of a round of `--roads varied`; None on the paper's roads."""
 
     @property
     def dataset_camera(self) -> CameraParameters:
@@ -72,7 +72,8 @@ class RoundHeader:
 
     @property
     def line_offsets(self) -> LineOffsets:
-        """Of varied roads: where the lines of each marking lie, see `trackfeatures.measure`."""
+        """Lateral offsets in m of the lines of each marking (`trackfeatures.measure`); () without a
+        varied road."""
         if self.varied is None:
             return ()
         lines = [each["lines"] for each in self.varied["carriageway"]["markings"]]
@@ -120,8 +121,8 @@ class RoundHeader:
 
 @dataclass(frozen=True, slots=True)
 class RoundResult:
-    """Totals of a finished round: `driverview.result`. `content_hash` is the SHA-256 of its images
-    and labels."""
+    """The record `driverview.result`: totals of a finished round. `content_hash` is the SHA-256 of
+    its images and labels."""
 
     frames: int
     content_hash: str
@@ -140,9 +141,9 @@ class RoundResult:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """Added by `datagen recover`: the round holds only the undamaged frames of `source`.
+    """The record that `datagen recover` adds: the round has only the undamaged frames of `source`.
 
-    `lost` frames are missing. `at_least`: the original number was unknown, more may be missing.
+    `lost` frames are missing, or more with `at_least`, where the original number is unknown.
     """
 
     source: str
@@ -191,7 +192,8 @@ class RoundInfo:
 
     @property
     def track_group(self) -> str:
-        """What frames are counted by: the track, or `random` for all random roads (`random:7`)."""
+        """Group in which frames are counted: the track, or `random` for all random roads
+        (`random:7`)."""
         return "random" if self.track.startswith("random:") else self.track
 
     def values_of(self, name: str) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ PAIRS_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class SplitConfig:
-    """Options of `datagen split`, which has their defaults."""
+    """Options of `datagen split`; the command declares their defaults."""
 
     by: str
     test_share: float

@@ -36,7 +36,7 @@ class Card:
 
 
 def contact_sheet(dataset: Dataset, most: int = 24) -> Iterator[Card]:
-    """Up to `most` frames, one a round; rounds of tracks and lights not shown yet come first."""
+    """Up to `most` frames, one per round; rounds of tracks and lights not shown yet come first."""
     chosen = _diverse_order(dataset.rounds)[:most]
     for place, number in enumerate(chosen):
         info = dataset.rounds[number]

@@ -93,7 +93,7 @@ def _histograms(by_split: dict[str, Labels]) -> Iterator[Markup]:
 
 
 def concerns(statistics: dict[str, Any], rounds: Iterable[RoundInfo]) -> list[str]:
-    """Sentences on the `statistics` of `datagen.recording.statistics.describe` and the rounds."""
+    """Warnings, from the `statistics` of `datagen.recording.statistics.describe` and the rounds."""
     return [
         *_empty_splits(statistics),
         *_rare_labels(statistics),

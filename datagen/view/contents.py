@@ -94,7 +94,8 @@ class Contents:
         return _plots(list(self.steps))
 
     def markings(self, number: int) -> list[Points]:
-        """True markings in the image, (k, 2) px each from its upper left corner."""
+        """True markings in the image, (k, 2) each, in px from the upper left corner of the
+        image."""
         lines = self.steps.message(ANNOTATIONS, number).points
         return [np.array([(p.x, p.y) for p in line.points]).reshape(-1, 2) for line in lines]
 

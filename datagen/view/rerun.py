@@ -1,4 +1,5 @@
-"""Converts a round to a Rerun recording: images with markings, the world in 3D, plots; and layout.
+"""Converts a round to a Rerun recording: images with markings, the world in 3D, plots, and the
+viewer's layout.
 
 World frame as recorded, z up. Time is counted from the start of the round, s.
 """

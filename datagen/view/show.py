@@ -20,7 +20,7 @@ OnShown = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ShowConfig:
-    """Options of `datagen view`, which has their defaults."""
+    """Options of `datagen view`; the command declares their defaults."""
 
     html: Path | None
     save: Path | None
@@ -28,7 +28,7 @@ class ShowConfig:
     port: int
 
     def validate(self) -> None:
-        """Raise UserError for options that cannot be met, before anything is read."""
+        """Raise UserError for impossible options, before anything is read."""
         if sum((self.html is not None, self.save is not None, self.web)) > 1:
             raise UserError("--html, --save and --web exclude each other; give one of them")
         for path in (self.html, self.save):

@@ -98,7 +98,7 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
 
 
 def default_out(file: Path) -> Path:
-    """Beside the file; for a round of a dataset in its folder `recovered/`."""
+    """The default output: beside `file`, or for a round of a dataset in the folder `recovered/`."""
     if file.parent.name == ROUNDS:
         return file.parent.parent / "recovered" / file.name
     return file.with_name(f"{file.stem}.recovered.mcap")

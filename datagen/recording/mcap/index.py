@@ -68,7 +68,7 @@ class Messages(Protocol):
 
 
 class CheckedChunks:
-    """Which chunks of a memory-mapped file were found undamaged; each is read once a process.
+    """Which chunks of a memory-mapped file were found undamaged; each is read once per process.
 
     A CRC of 0 means that the writer computed none (mcap.dev/spec): such a chunk is taken as it is.
     """
@@ -131,7 +131,7 @@ class MappedMessages:
 
     @cached_property
     def _table(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Log times, file offsets and numbers of chunks, from the message index after each."""
+        """Log times, file offsets and chunk numbers, from the message index after each chunk."""
         parts, starts, numbers, sizes = [], [], [], []
         for number, chunk in enumerate(self.summary.chunks):
             at = chunk.indexes.get(self.channel)

@@ -141,7 +141,7 @@ def command(given: DriverCommand) -> bytes:
 
 
 def traffic(frame: Frame, time: Timestamp) -> bytes:
-    """All cars as boxes: the others in the world frame, the ego car in its own."""
+    """All cars as boxes: other cars in the world frame, the ego car in its body frame."""
     message = SceneUpdate()
     ego = (0.0, 0.0, EGO_BOX_CENTRE_HEIGHT_M, 0.0, 0.0, 0.0)
     _add_box(message, "ego", EGO, ego, EGO_SIZE_M, BLUE, time)

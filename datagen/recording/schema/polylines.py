@@ -21,8 +21,8 @@ CORNER_PX = 0.5
 def read_polylines(message: memoryview) -> list[NDArray[np.float64]]:
     """The polylines (n, 2) of an ImageAnnotations message, in their order.
 
-    Points follow each other in 20 bytes each and are read as one array, not as so many objects of
-    protobuf. Raises ValueError when the message is damaged.
+    Each point takes 20 bytes, and all points are read as one array instead of one protobuf object
+    each. Raises ValueError when the message is damaged.
     """
     return [_points(message[start:end]) for start, end in bytes_fields(message, LINES)]
 
