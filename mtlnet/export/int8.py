@@ -1,7 +1,7 @@
 """The int8 form of a graph (by NNCF), and the accuracy gate that it must pass.
 
-Quantised are the weights of all convolutions and of the shared layers except the last, and the
-activations of most convolutions, calibrated on training frames. Which convolutions keep float
+The weights of all convolutions and of all shared layers except the last are quantised, and so are
+the activations of most convolutions, calibrated on training frames. Which convolutions keep float
 activations is chosen by greedy forward selection until the gate is passed on train rounds that were
 held out of the training (for another dataset: on a twelfth of its train rounds). The gate itself
 uses the test rounds, on which nothing is chosen. The fully connected layers are memory-bound. The
@@ -30,9 +30,9 @@ from runtime.processor import has_int8
 
 CALIBRATION_FRAMES = 300
 FLOAT_ACTIVATIONS: tuple[int, ...] = (0, 2)
-"""Numbers of the convolutions with float activations where none can be chosen: in the paper's
-network the first costs more distance accuracy than all others together, the third more angle
-accuracy."""
+"""Numbers of the convolutions with float activations where no choice is made. In the paper's
+network, quantising the activations of the first convolution costs more distance accuracy than
+quantising all others together, and the third costs more angle accuracy than all others together."""
 MAX_FLOAT_ACTIVATIONS, MAX_CONVOLUTIONS = 3, 16
 """Maximum number of convolutions with float activations; maximum number of convolutions of a
 network for which the choice is made."""

@@ -45,8 +45,8 @@ from trackfeatures.names import to_name
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 LEAST_OOD_SCORE = 1e-3
-"""Least out-of-distribution score in a comparison. The score of a model's only training image is 0
-apart from rounding; from 1 on an image counts as unfamiliar."""
+"""Least out-of-distribution score in a comparison. A model of a single training image gives that
+image a score of 0, apart from rounding; an image with a score above 1 is out of distribution."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,8 @@ def _require_equal(run: Path, check: dict[str, float]) -> None:
 
 
 def export_text(check: Mapping[str, float]) -> str:
-    """Text about a card's `export_check`; that has no frames where OpenVINO is missing."""
+    """Text about a card's `export_check`, whose number of frames is 0 if OpenVINO is not
+    installed."""
     if not check["frames"]:
         return "weights alone: OpenVINO, which writes the graph, is not installed"
     differences = [f"{name} {value:.2g}" for name, value in check.items() if name != "frames"]

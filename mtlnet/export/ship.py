@@ -1,8 +1,9 @@
 """`mtlnet ship --model RUN --out DIR`: a model as weights alone, in half the bytes.
 
 The folder has `model.safetensors` in float16, the uncertainty head in float32 and the card: all
-that an engine needs (`mtlnet.inference.engine.read_graph`). Answers, and those in the card, are
-computed from the rounded weights. `write_page` adds a README.md with the figures of evaluations.
+that an engine needs (`mtlnet.inference.engine.read_graph`). The answers of the shipped model, and
+the answers in its card, are computed from the rounded weights. `write_page` adds a README.md with
+the figures of evaluations.
 """
 
 import json
