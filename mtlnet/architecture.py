@@ -9,13 +9,13 @@ the outputs are our six coded values instead of their fourteen, and linear, with
 mean image is subtracted; training uses our recipes. It has no classifier: each class has
 probability one third.
 
-`grid`: five convolutions that keep a grid of 9 x 18 places, where the paper's end in one place; its
-outputs are distributions over bins (`mtlnet.model.bins`). The rows of the sky are not read. In
-training, auxiliary heads read the positions of the lane's markings from the grid and the curvature
-ahead from the shared features (`mtlnet.model.auxiliary`).
+`grid`: five convolutions that keep a grid of 9 x 18 places; the paper's convolutions end in a
+single place. Its outputs are distributions over bins (`mtlnet.model.bins`). It does not read the
+image rows of the sky. In training, auxiliary heads read the positions of the lane's markings from
+the grid and the curvature ahead from the shared features (`mtlnet.model.auxiliary`).
 
-`grid_residual`: `grid` with six residual convolutions more, for long trainings; it can start from a
-trained `grid` (`mtlnet.model.pretrained`).
+`grid_residual`: `grid` with six additional residual convolutions, for long trainings; it can start
+from a trained `grid` (`mtlnet.model.pretrained`).
 
 `mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
 weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.

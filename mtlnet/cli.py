@@ -104,7 +104,7 @@ def ship_command(
     picture: options.ShippedPicture = None,
     as_json: command.AsJson = False,
 ) -> None:
-    """Write a model as weights alone, in float16, small enough for a repository.
+    """Write only the weights of a model, in float16: small enough for a repository.
 
     With --evaluation: write README.md, with the figures of evaluations, for the model in --out.
     """
@@ -137,8 +137,8 @@ def evaluate_command(
     precision: options.Precision = None,
     as_json: command.AsJson = False,
 ) -> None:
-    """Evaluate a model on a dataset: errors in m and rad, and those of a constant prediction (the
-    training mean)."""
+    """Evaluate a model on a dataset: its errors in m and rad beside the errors of always predicting
+    the training mean."""
     import os
 
     from rich.console import Console

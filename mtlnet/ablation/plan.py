@@ -1,4 +1,4 @@
-"""The paper's ablation: which tasks to learn together and with which weights; two other networks.
+"""The paper's ablation: single tasks, the four task weightings MTL 1 to 4, and two other networks.
 
 Every row is trained once per seed with equal iterations on the same data, and evaluated on the same
 rounds in float32. A run has an ordinary run folder. Finished runs are kept, so that an interrupted
@@ -173,7 +173,7 @@ def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) 
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """The evaluation of a finished run; None if there is none, or if it is of other weights."""
+    """The evaluation of a finished run; None if it is missing or belongs to other weights."""
     if not (folder / EVALUATION).is_file() or not (folder / CARD).is_file():
         return None
     try:
@@ -188,7 +188,7 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of the table. `task`: index in alpha of the task that it measures.
+    """A column of the table. `task`: index, in the task weights alpha, of the measured task.
 
     `path`: keys of the figure in an evaluation.
     """

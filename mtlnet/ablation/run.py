@@ -78,8 +78,8 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
 
 
 def write_result(config: AblationConfig, rows: Sequence[Row], runs: list[Run]) -> dict[str, Any]:
-    """Write `ablation.json` and `ablation.html` for the finished runs; returns the former's
-    content."""
+    """Write `ablation.json` and `ablation.html` for the finished runs; returns the content of
+    `ablation.json`."""
     entries = table(rows, runs)
     result = {**config.shared_settings(), "data": str(config.data), "rows": entries}
     write_json(config.out / "ablation.json", result)
@@ -120,7 +120,7 @@ def _evaluate_run(run: Path, config: AblationConfig) -> dict[str, Any]:
 def _plan_with_times(
     config: AblationConfig, runs: Sequence[Run], dataset: Dataset, console: Console
 ) -> dict[str, Any]:
-    """The runs, with the seconds that each still takes."""
+    """The runs, each with the seconds of training that remain."""
     seconds = {
         name: step_seconds(config, name, runs, dataset)
         for name in dict.fromkeys(run.row.network for run in runs)
@@ -148,7 +148,7 @@ def _plan_with_times(
 def step_seconds(
     config: AblationConfig, network: str, runs: Sequence[Run], dataset: Dataset
 ) -> float:
-    """Median seconds per step: of finished runs of the network, or of a few steps taken now."""
+    """Median seconds per step, from finished runs of the network or from a few steps taken now."""
     speeds = [
         point["images_per_second"]
         for run in runs
@@ -180,14 +180,14 @@ SINGLE_TASK_COLOUR = "#6a3fb5"  # the paper's purple line
 FINAL_SHARE = 0.05
 """Share of a run, at its end, over which its final loss is averaged."""
 PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
-"""Columns followed by the paper's figures, with their digits; the paper does not define its losses
-exactly."""
+"""Columns after which the page shows the paper's figures, and their numbers of decimal places. The
+paper does not define its losses exactly."""
 
 
 def page(
     config: AblationConfig, entries: Sequence[dict[str, Any]], rows: Sequence[Row], runs: list[Run]
 ) -> str:
-    """HTML page with the losses and the paper's, the errors in metres and radians, and training
+    """HTML page with our losses beside the paper's, the errors in metres and radians, and training
     curves."""
     return render(
         "mtlnet.ablation",

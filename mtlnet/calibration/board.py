@@ -1,6 +1,6 @@
 """Calibrates a lens from pictures of a chessboard or a ChArUco board, with OpenCV.
 
-Board frame in squares; pixel centres at whole numbers.
+Points on the board are in units of the side of a square; pixel centres have whole coordinates.
 """
 
 from collections import Counter
@@ -74,9 +74,9 @@ def calibrate_board(
     """The lens of the camera that took `paths`, which all show one board.
 
     `board`: inner corners of a chessboard, such as "9x6"; "charuco:5x7" for the squares of a
-    ChArUco board, followed by ":DICTIONARY:MARKER" (side of a marker in squares) if these are not
-    4X4_50 and 0.75; empty: the chessboard that most pictures show. The mount is that of `model`.
-    Raises NoBoard.
+    ChArUco board, optionally followed by ":DICTIONARY:MARKER", the ArUco dictionary and the side of
+    a marker in squares (default ":4X4_50:0.75"); empty: the chessboard that most pictures show. The
+    mount is taken from `model`. Raises NoBoard.
     """
     pictures = [(path, *_read(path)) for path in paths]
     sizes = {grey.shape for _, grey, _ in pictures if grey is not None}
@@ -244,8 +244,8 @@ def _projection(fisheye: bool) -> Callable[..., Any]:
 
 
 def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """Error in px, matrix, coefficients, rotations and translations of the boards, deviation of
-    fy."""
+    """Error in px, camera matrix, coefficients, rotations and translations of the boards, and
+    standard deviation of fy."""
     flags = cv2.CALIB_FIX_K3 if len(pairs) < FEW else 0
     boards, corners = ([pair[k] for pair in pairs] for k in range(2))
     *found, deviations, _, _ = cv2.calibrateCameraExtended(
@@ -255,7 +255,7 @@ def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
 
 
 def _fisheye(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """As `_usual` for a fisheye lens; OpenCV gives no deviations, so that of fy is 0."""
+    """As `_usual`, for a fisheye lens. OpenCV gives no deviations, so the deviation of fy is 0."""
     names: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, 5
     found = cv2.fisheye.calibrate(
         [board.reshape(1, -1, 3).astype(np.float64) for board, _ in pairs],

@@ -33,7 +33,8 @@ Report = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class Drive:
-    """The estimate, some of the pictures, and what was wrong with the film (empty: nothing)."""
+    """The estimate, some of the pictures, and a text about the film's fault (empty if it has
+    none)."""
 
     found: DriveEstimate
     shown: list[Picture]

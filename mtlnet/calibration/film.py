@@ -28,15 +28,15 @@ LANE_WIDTH_M = 3.6
 """Lane width assumed if none is given, m."""
 LANE_WIDTH_STD_M = 0.25
 MAX_STD_DEG = 1.0
-"""Maximum standard deviation of pitch and yaw, degrees, without that of the lens; a drive with a
-larger one is refused."""
+"""Maximum standard deviation of pitch and yaw, degrees, apart from the part that the lens adds. A
+drive with a larger one is refused."""
 LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
 """Time between the pictures whose markings are used, s."""
 FOLLOW_S = (0.09, 0.25)
 """Limits of the time between two pictures in which points are followed, s."""
 KEPT = 600
-"""Maximum number of pictures that are kept: of a stream the latest two minutes."""
+"""Maximum number of pictures that are kept; for a stream these are the latest two minutes."""
 FIRST_LOOK = 25
 """Number of pictures after which the horizon is roughly known; the width of markings in the picture
 depends on it."""
@@ -97,8 +97,8 @@ class DriveEstimate:
 class DriveCalibration:
     """Collects pictures of a drive and estimates the mount of their camera.
 
-    `lens`: its place x, y in the car is kept; height and angles are estimated. A lane width is
-    assumed if none is given.
+    The place x, y of `lens` in the car is kept; height and angles are estimated. Without a given
+    lane width, `LANE_WIDTH_M` is assumed.
     """
 
     def __init__(self, lens: Lens, lane_width_m: float | None = None) -> None:
@@ -166,7 +166,7 @@ class DriveCalibration:
         return self._estimate(mount)
 
     def _motions(self, start: tuple[float, float]) -> list[TimedMotion]:
-        """All motions, each estimated from the starting point that it has the direction of most
+        """All motions; the search for each direction of travel starts at the direction of most
         motions."""
         noise, towards = TRACK_NOISE_PX / self._view.focal_px, np.array(start)
         motions: list[TimedMotion] = []

@@ -24,8 +24,8 @@ HEAD_BYTES = 1 << 17
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera's size and lens. `std`: relative standard deviation of the focal length; `about`:
-    its origin, in words."""
+    """A camera's size and lens. `std`: relative standard deviation of the focal length; `about`: a
+    text about the source of these values."""
 
     camera: CameraParameters
     std: float
@@ -41,8 +41,9 @@ def find_lens(
 ) -> Lens:
     """The lens of pictures of `size` (width, height).
 
-    It is `given`, or has this field of view, or that of `photo`, or a guessed one. Its place in the
-    car is the model's. Raises UserError.
+    The first known of: the lens `given`, the field of view `fov_y_deg`, the focal length of
+    `photo`; else a guess. Its place in the car is the place of the model's camera. Raises
+    UserError.
     """
     width, height = size
     if given is not None:

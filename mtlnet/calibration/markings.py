@@ -1,7 +1,7 @@
 """Finds bright or yellow bars in the rows of a road picture, and the segments that they form.
 
-In a row, the width of a marking is that of its paint, in units of the camera's height, times the
-number of rows below the horizon, whatever its direction. Pixels: u to the right, v down, pixel
+In an image row, a marking is w n px wide, whatever its direction: w is the width of its paint in
+camera heights, n the number of rows below the horizon. Pixels: u to the right, v down, pixel
 centres at whole numbers.
 """
 
@@ -53,7 +53,7 @@ def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
 
 
 def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
-    """Difference of each pixel to the brighter of the two pixels `reach` (rows,) px beside it."""
+    """Each pixel minus the brighter of the two pixels `reach` (rows,) px to its left and right."""
     width = level.shape[1]
     columns = np.arange(width)
     shift = np.rint(reach).astype(np.int64)[:, None]

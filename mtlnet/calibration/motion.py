@@ -67,8 +67,8 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> t
 
 
 def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion | None:
-    """Motion from normalised `tracks` (N, 4), starting from a guess (2,) of the point that the
-    camera travels to; `noise`: of a track, in normalised coordinates."""
+    """Motion from normalised `tracks` (N, 4). `towards` (2,): a first guess of the point that the
+    camera travels to. `noise`: standard deviation of a track, in normalised coordinates."""
     n = len(tracks)
     p = np.column_stack([0.5 * (tracks[:, :2] + tracks[:, 2:]), np.ones(n)])
     v = np.column_stack([tracks[:, 2:] - tracks[:, :2], np.zeros(n)])

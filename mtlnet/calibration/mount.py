@@ -24,20 +24,22 @@ STRAIGHT = 0.002
 """Maximum bend of a fit on straight road: a radius of at least 300 m for a camera at 1.2 m."""
 HEIGHTS_M = (0.7, 3.0)
 LANE_SPREAD = 0.08
-"""Maximum relative difference of a lane's width from its usual one."""
+"""Maximum relative difference of a lane's width from the usual width."""
 OWN_LANE_STD, OWN_LANE_REPEAT = 0.015, 3.0
-"""Relative standard deviation of the own lane's width in a picture; number of consecutive pictures
-with similar errors."""
+"""Relative standard deviation of the measured width of the car's own lane in a picture; number of
+consecutive pictures whose errors are similar."""
 NEXT_LANES_ROLL_STD = np.radians(1.0)
-"""Standard deviation of the roll that makes the next lanes as wide as the own one: roads fall off
-to both sides, and lanes differ in width."""
+"""Standard deviation of the roll at which the neighbouring lanes look as wide as the car's own
+lane: roads fall off to both sides, and lanes differ in width."""
 MIN_SLOPE = 0.25
-"""Least slope of a marking beside the own lane; a car nearer to a marking is changing lanes."""
+"""Least slope of the markings of the car's own lane; with a smaller one, the car is changing
+lanes."""
 ROLL_PRIOR = np.radians(2.0)
 FLOOR = np.radians(0.1)
-"""Standard deviation that the car itself adds: its springs, and how straight it runs."""
+"""Standard deviation (rad) due to the car itself: it moves on its springs and does not run exactly
+straight."""
 MAX_TURN = 0.06
-"""Rate of turn, rad/s, above which the direction of travel is not that of the car."""
+"""Yaw rate, rad/s, above which the direction of travel differs from the direction of the car."""
 WINDOW_S = 0.65
 MAX_GAP_S = 0.5
 MIN_SPEEDS = 25
@@ -84,7 +86,8 @@ class Mount:
 
 @dataclass(frozen=True)
 class _Roads:
-    """Fits (N,) as columns. `lane`: difference of the slopes of the own lane's two markings."""
+    """N fits, a column for each quantity. `lane`: difference of the slopes of the own lane's
+    markings."""
 
     time_s: FloatArray
     x0: FloatArray
@@ -184,8 +187,8 @@ def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
 
 
 def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
-    """The correction of `roll` that makes the lane's width independent of the car's position in the
-    lane, and the standard deviation of the corrected roll.
+    """The correction of `roll` with which the measured width of the lane does not depend on the
+    car's position in it, and the standard deviation of the corrected roll.
 
     A roll r widens a lane by 1 + 2 r c, where c is the mean slope of its two markings.
     """
@@ -290,8 +293,8 @@ def _travel(
 
 
 def _weighted(values: list[float], stds: list[float]) -> tuple[float, float]:
-    """Mean weighted by inverse variance, with FLOOR added; its standard deviation covers the
-    values' difference."""
+    """Mean weighted by inverse variance, with FLOOR added; its standard deviation includes the
+    difference between the values."""
     weight = np.array([1.0 / (std**2 + FLOOR**2) for std in stds])
     found = float(np.dot(weight, values) / weight.sum())
     return found, float(max(weight.sum() ** -0.5, np.ptp(values) / 2))

@@ -159,8 +159,8 @@ def _slope_std(lines: Lines, below: FloatArray) -> FloatArray:
 def _members(
     lines: Lines, state: FloatArray, wide: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
-    """Which segments lie on a marking, the number of their marking among those kept, and which are
-    kept."""
+    """A mask of the segments that lie on a marking, the index of each one's marking among the kept
+    markings, and a mask of the kept markings."""
     x0, y0, bend = state[:3]
     slopes, below = state[3:], _below(lines, y0)
     away = lines.x[:, None] - (x0 + slopes * below[:, None] + bend / below[:, None])

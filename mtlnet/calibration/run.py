@@ -23,8 +23,8 @@ def calibrate(
 ) -> tuple[dict[str, Any], str]:
     """Write the camera file; returns the result, and a line of text about it.
 
-    Raises UserError, also for a film that breaks off or is damaged; if the readable part was
-    sufficient, the camera file has been written.
+    Raises UserError, also for a film that is truncated or damaged. The camera file is written
+    before that if the readable part is sufficient.
     """
     check_folder(config.out)
     if config.page is not None:

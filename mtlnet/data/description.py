@@ -37,7 +37,7 @@ def describe_data(
 
 
 def mean_labels(labels: LabelArrays) -> dict[str, Any]:
-    """Mean of the labels and their most frequent class; None for markings that are never
+    """Means of the labels, and their most frequent class; None for markings that are never
     present."""
     distances = nan_where_unknown(labels.distances.astype(np.float64))
     counts = (~np.isnan(distances)).sum(0)

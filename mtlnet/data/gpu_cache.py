@@ -27,8 +27,8 @@ PREFETCH = 4  # batches whose labels are computed in advance
 
 @dataclass(frozen=True)
 class DeviceBatch:
-    """A batch on the device: `images` uint8 (B, H, W, 3), `coded` (B, 6), `heading` (B,), `ahead`
-    (B, A)."""
+    """A batch on the device: `images` uint8 (B, H, W, 3), `coded` (B, 6), `heading` (B,), and
+    `ahead` (B, A), as in `mtlnet.data.loader.Batch`."""
 
     images: Tensor
     coded: Tensor

@@ -71,7 +71,8 @@ class AheadLabels(Protocol):
     def labels(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Labels (B, A) of frames augmented with `params`."""
+        """Labels (B, A) of B frames augmented with `params`; A =
+        `mtlnet.model.auxiliary.LABELS`."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ class Batch:
     coded: NDArray[np.float32]
     heading: NDArray[np.int64]
     ahead: NDArray[np.float32]
-    """Labels of the road ahead: A is 0, or the number of labels of `mtlnet.model.auxiliary`."""
+    """Labels of the road ahead (B, A). A is 0 without auxiliary heads, else
+    `mtlnet.model.auxiliary.LABELS`."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,8 @@ class Loader:
     def read_ahead(
         self, chosen: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Labels of the road ahead (B, A) of frames augmented with `params`."""
+        """Labels of the road ahead (B, A) for B frames augmented with `params`; see
+        `Batch.ahead`."""
         if self._ahead is None:
             return np.zeros((len(chosen), 0), np.float32)
         return self._ahead.labels(chosen, params)

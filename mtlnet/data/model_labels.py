@@ -51,7 +51,7 @@ def moved_rounds(frames: Frames) -> list[tuple[int, RoundInfo]]:
 
 
 def round_rectification(info: RoundInfo, camera: CameraParameters) -> Rectification:
-    """Rectification from the camera with which a round was labelled to `camera`, the model's."""
+    """Rectification from the camera with which a round was labelled to the model's `camera`."""
     return Rectification(info.label_camera, camera, any_height=True)
 
 

@@ -120,7 +120,7 @@ def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) ->
 
 
 def drop_undecodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
-    """`frames` without the undecodable ones, and the names of these.
+    """`frames` without the undecodable frames, and the names of the undecodable frames.
 
     Raises DatasetError when no frame is left.
     """

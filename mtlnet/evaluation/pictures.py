@@ -96,9 +96,9 @@ def _features(distances: NDArray[Any], angle: NDArray[Any]) -> NDArray[np.float6
 
 
 def picture_report(answers: Answers, mean: dict[str, Any]) -> dict[str, Any]:
-    """The report of `mtlnet.evaluation.metrics`, with that of this module under `pictures`.
+    """The report of `mtlnet.evaluation.metrics`; its key `pictures` has the report of this module.
 
-    `mean`: from `mtlnet.data.description.mean_labels`, the baseline of the former.
+    `mean`: the baseline, from `mtlnet.data.description.mean_labels`.
     """
     labels = answers.images.labels
     report = evaluate_outputs(answers.outputs, labels, mean)

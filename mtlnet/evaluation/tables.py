@@ -45,7 +45,7 @@ def report_tables(result: dict[str, Any]) -> list[Table]:
 
 
 def evaluation_table(result: dict[str, Any]) -> Table:
-    """Errors of a model on active labels, and those of the constant training mean."""
+    """Errors of a model on active labels, and the errors of always answering the training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
     table = Table(title=escape(printable(title)))
     for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):

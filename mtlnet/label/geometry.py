@@ -54,9 +54,9 @@ def fit_markings(
 ) -> Markings:
     """The markings through points (N, 2) of each, px of the camera's pictures.
 
-    `curvature` None: it is fitted too, from a third point on either marking; `pitch_deg` None: so
-    is the pitch, from where the markings would meet. Least squares of the points' lateral
-    distances, converted to px. Raises MarkingsError.
+    `curvature` None: it is fitted too, from a third point on either marking. `pitch_deg` None: the
+    pitch is fitted too, from the point where the markings would meet. Least squares of the points'
+    lateral distances, converted to px. Raises MarkingsError.
     """
     points = [np.asarray(side, np.float64).reshape(-1, 2) for side in (left, right)]
     if min(map(len, points)) < 2:
@@ -91,7 +91,7 @@ def _refine(
     free: NDArray[np.bool_],
     steps: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Sum of squares, px^2, and the values (5,) after fitting the `free` ones.
+    """Sum of squares, px^2, and the values (5,) after those at the indices `free` were fitted.
 
     By the method of Levenberg and Marquardt. The sum is infinite where a point is not on the road,
     and stays so from such a start.

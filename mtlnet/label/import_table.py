@@ -64,8 +64,9 @@ def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
 def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> dict[str, Any]:
     """Copy the pictures of a table to `folder`, with `labels.csv` and camera files.
 
-    The last of `stds` that matches a file is used. Returns `folder`, `pictures` and `cameras`.
-    Raises UserError for a faulty row, and if `folder` has labels already.
+    A file gets the standard deviations of the last entry of `stds` whose pattern matches its name.
+    Returns a dict: `folder`, and the numbers of `pictures` and `cameras`. Raises UserError for a
+    faulty row, and if `folder` has labels already.
     """
     if (folder / LABELS).exists():
         raise UserError(f"{folder / LABELS} exists; give a new folder")

@@ -29,7 +29,8 @@ def load_pretrained(
 
     `weights`: the model's file. `images` (B, 210, 280, 3): the statistics of the network's batch
     normalisation are measured on them; None for a network without it. `name`: the model's
-    architecture, if it is another. Raises UserError when the network does not contain the model.
+    architecture, if it is not the network's. Raises UserError when the network does not contain the
+    model.
     """
     source = load_network(weights, name or network.architecture.name)
     state = source.state_dict()

@@ -1,7 +1,7 @@
 """Finds the camera that took the pictures of a source, for `mtlnet predict`.
 
-It is the one that the user gives, else the one that a recording states, else the one that the drive
-itself shows (`mtlnet.calibration`).
+The first known of: the camera that the user gives, the camera that a recording states, the camera
+estimated from the pictures of the drive (`mtlnet.calibration`).
 """
 
 from dataclasses import replace
@@ -37,8 +37,8 @@ class _ModelsOwn(Exception):
 def with_lens(
     source: Source, model: CameraParameters, given: Lens, note: Note, *, calibrate: bool = False
 ) -> Source:
-    """The source with its lens: `given`, else that of the camera that a recording states, else with
-    `calibrate` that of the camera that a film or a stream shows.
+    """The source with its lens: `given`, else the lens that a recording states, else with
+    `calibrate` a lens estimated from the pictures of the film or stream.
 
     If a field of view is given, `calibrate` estimates the mount. `note`: called with a line about
     what was found.

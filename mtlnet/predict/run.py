@@ -28,7 +28,7 @@ KEPT_ROWS = 10_000
 
 
 class InputsLeftOut(UserError):
-    """Some inputs or images could not be used; `results` are those of all others."""
+    """Some inputs or images could not be used; `results` has the results of all other images."""
 
     def __init__(self, message: str, results: list[dict[str, Any]]) -> None:
         super().__init__(message)
@@ -49,11 +49,12 @@ def predict_files(
     """Predict the features of all images that `inputs` name (`mtlnet.sources.find.find_sources`).
 
     Returns the results of the first `KEPT_ROWS` images; all are written to each of `outputs`
-    (`mtlnet.predict.writers.open_writer`), image by image. `lens`: of all sources but recorded
-    rounds, which must be of the model's camera; None: what is known of the source, else the
-    model's. `report`: called with the numbers of images done and in total. `note`: called with a
-    line about what is left out or found. `topic`: of recordings. `calibrate`: estimate the camera
-    of films and streams from their pictures. Ctrl-C ends a stream normally.
+    (`mtlnet.predict.writers.open_writer`), image by image. `lens`: the lens of all sources except
+    recorded rounds, which must be of the model's camera; None: the lens that is known for the
+    source, else the model's. `report`: called with the numbers of images done and in total. `note`:
+    called with a line about what is left out or found. `topic`: the topic to read from recordings.
+    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends a stream
+    normally.
 
     Raises InputsLeftOut, after all others are done, when an input or an image could not be used;
     UserError at once for an invalid `lens`, and for outputs that cannot be written or are among the

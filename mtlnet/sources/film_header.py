@@ -28,8 +28,8 @@ MP4_FIRST = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"st
 
 
 def missing_end(path: Path) -> str:
-    """What is missing at the end of the file, in words; empty if nothing is, or if no size is
-    stated (MPEG-TS, raw streams)."""
+    """A text about what is missing at the end of the file; empty if nothing is missing, or if the
+    format states no size (MPEG-TS, raw streams)."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(16)

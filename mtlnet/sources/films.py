@@ -49,8 +49,8 @@ def read_film_header(path: Path) -> FilmHeader:
 
 @dataclass
 class Film:
-    """A film being read. `fault` is known after all frames: what is wrong, in words; empty if
-    nothing is."""
+    """A film being read. `fault`, set after the last frame, is a text about the film's fault; empty
+    if it has none."""
 
     path: Path
     fault: str = ""

@@ -41,8 +41,8 @@ class LensFinder(Protocol):
 
 
 class Pictures(Protocol):
-    """A source of pictures. `fault` is known after the last one: what is wrong, in words; empty if
-    nothing is."""
+    """A source of pictures. `fault`, set after the last picture, is a text about the source's
+    fault; empty if it has none."""
 
     fault: str
 

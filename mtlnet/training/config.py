@@ -1,6 +1,6 @@
 """The configuration of a training run: its fields are the options of `mtlnet train`.
 
-The defaults in the help are those of a new run; a resumed run keeps what it has stored.
+The help shows the defaults of a new run; a resumed run keeps its stored values.
 """
 
 import math

@@ -23,8 +23,8 @@ in network `deepdriving` takes two cores twenty seconds per step."""
 MUON_MAX_SHARED_SIDE = 512
 """Maximum of the longer side of the matrix of a shared layer other than the first."""
 MUON_LR_SCALE = 8.0
-"""Ratio of Muon's learning rate to the recipe's: updates of AdamW's size allow longer steps with
-Muon."""
+"""Ratio of Muon's learning rate to the recipe's. Muon's updates are scaled to the size of AdamW's,
+and it tolerates longer steps."""
 
 
 class OptimizerSet:

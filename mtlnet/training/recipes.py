@@ -175,10 +175,11 @@ def frozen_convolutions(recipe: Recipe, progress: float) -> int:
 def learning_rate_factor(recipe: Recipe, batch: int) -> float:
     """Ratio of the learning rate for `batch` images per step to the recipe's own.
 
-    SGD: the ratio of the batch sizes (Goyal et al. 2017, "Accurate, Large Minibatch SGD"). AdamW
-    and Muon, whose step length does not depend on the gradient's: its square root (Krizhevsky 2014;
-    Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms", who
-    derive it for Adam; unlike there, the momenta are not scaled).
+    SGD: the ratio r of the batch sizes (Goyal et al. 2017, "Accurate, Large Minibatch SGD"). AdamW
+    and Muon: sqrt(r), because the length of their steps does not depend on the length of the
+    gradient (Krizhevsky 2014). Malladi et al. 2022 ("On the SDEs and Scaling Rules for Adaptive
+    Gradient Algorithms") derive sqrt(r) for Adam; they also scale the momenta, which is not done
+    here.
     """
     ratio = batch / recipe.batch
     return ratio if recipe.optimizer == "sgd" else math.sqrt(ratio)

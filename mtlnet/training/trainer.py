@@ -25,8 +25,8 @@ from runtime.processor import has_bf16
 
 MIN_TARGET_STD = (0.01,) * 6
 FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
-"""Lower bounds of the heads' units (6,). For fine-tuning they are those of varied driving, because
-a few images may be nearly identical."""
+"""Lower bounds of the heads' units (6,) in fine-tuning: standard deviations of the targets in
+varied driving, because a few images can be nearly identical."""
 MIN_STEPS_BEFORE_BN_FREEZE = 100
 """Number of steps after which the running statistics of batch normalisation no longer depend on the
 initial weights."""

@@ -60,9 +60,9 @@ MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
 """Limits of a standard deviation, relative to the RMS error, which a few large errors determine."""
 MIN_FEATURE_STD_SHARE = 0.1
 MIN_LIGHT_STD = np.repeat([0.1, 0.1, 0.1, 0.02, 0.02], HALVES)
-"""Lower limits for the standard deviations of `light_features`: about half of what colours and
-contrasts vary by over all lights. A model of one scene sees less variation, but another scene must
-not be far away for it."""
+"""Lower limits for the standard deviations of `light_features`: about half of their standard
+deviations over all lights. The images of a model of one scene vary less, but another scene must not
+be many standard deviations away."""
 LOG_STD_LIMITS = (math.log(MIN_STD_SHARE), math.log(MAX_STD_SHARE))
 COVERED = (0.6827, 0.9545)
 """Shares of a normal distribution within one and two standard deviations."""
@@ -84,7 +84,7 @@ def fit_uncertainty_head(
 
     Without held-out frames it is fitted on the train frames alone, and its standard deviations are
     too small; the model card then lists no held-out rounds. In that case it does not read the
-    light, because so few rounds show too few sceneries.
+    light, because that few rounds do not show enough sceneries.
     """
     count = network.architecture.uncertainty_inputs
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)

@@ -1,5 +1,5 @@
-"""Image files of this machine other than JPEG and PNG: those that OpenCV reads; the others are
-named.
+"""Image files of this machine other than JPEG and PNG. Kinds that OpenCV reads are decoded; for
+other kinds the error message names the kind.
 
 The kind of a file is determined by its first bytes, not its name. Its size is read from its header
 before OpenCV decodes it, because OpenCV allocates what the header states. If a file has several

@@ -30,8 +30,8 @@ DAMAGE = (
 
 
 class Container(Protocol):
-    """A recording. `fault` is known after all messages: what is missing, in words; empty if nothing
-    is."""
+    """A recording. `fault`, set after the last message, is a text about what is missing; empty if
+    nothing is missing."""
 
     fault: str
 
