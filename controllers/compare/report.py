@@ -34,7 +34,7 @@ def spread(values: list[float], digits: int) -> str:
 
 
 def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Titles and rows of the paper's table: scores a step by track and controller.
+    """Titles and rows of the paper's table: scores per step by track and controller.
 
     Tracks that were driven over the paper's number of steps also show the paper's scores.
     """

@@ -36,8 +36,8 @@ SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
 """Settings that are equal for all drives of a file."""
 
 Progress = Callable[[int, int, str, float], None]
-"""A function that is called with the number of drives done, their total number, the name of the
-present drive and the share of it that is done."""
+"""A function that is called with the number of finished drives, the number of all drives, the name
+of the present drive and its finished share."""
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,8 @@ def propose(
 
 
 def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float]) -> float:
-    """The mean reward a step over the tracks of `config`."""
+    """Drive `controller` with `parameters` on the tracks of `config`; returns the mean reward per
+    step."""
     rewards = []
     for name in names(config.tracks, "tracks"):
         track = find_track(name, config.tracks_dir)

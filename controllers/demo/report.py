@@ -94,7 +94,8 @@ def _check_error(what: str, error: float, mean: float, limit: float | None) -> L
 
 
 def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """The checks of the service's answers: mean errors up to the 95th percentile of the evaluation.
+    """The checks of the service's answers: their mean errors may reach the 95th percentile of the
+    evaluation's errors.
 
     A service with another camera or model than the evaluated one has far larger errors.
     """

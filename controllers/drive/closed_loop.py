@@ -25,7 +25,8 @@ from trackfeatures.errors import UserError
 
 GEAR = 1
 HOLD_S = 0.5
-"""Time (s) for which a lost offset keeps its last value; then it is 0, along the road."""
+"""Time (s) for which the last offset is used after it is lost; from then on the offset is taken as
+0, so that the car drives along the road."""
 RUN_UP_S = 15.0
 """Duration (s) of the standing start, which `cruising_kmh` leaves out."""
 EASE_OFF = 1.0  # m/s2 of demanded braking at which the throttle is closed

@@ -1,7 +1,7 @@
 """The film of a drive: the driver's view with true and perceived markings, and driving curves.
 
-The driver's view is on the left, the same markings from above are on the right; below are the
-offset and the angle of the last seconds. The truth is green, the perception orange.
+The driver's view is on the left, the same markings from above on the right. The curves below show
+the offset and the angle of the last seconds. The truth is green, the perception orange.
 """
 
 from collections import deque
@@ -27,7 +27,8 @@ CURVE_HEIGHT = 90  # px
 OFFSET_SPAN_M, ANGLE_SPAN_RAD = 1.0, 0.1
 """Values at the upper and lower edge of the curves; larger values are drawn at the edge."""
 NOTHING: tuple[Distances, float] = ({}, 0.0)
-"""The perceived markings of a drive on the truth, which shows only the true markings."""
+"""The perceived markings of a drive on the truth: there are none, and the film shows the true
+ones."""
 TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 
 

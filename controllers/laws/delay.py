@@ -13,9 +13,10 @@ SPANS = (1, 4)
 """Control steps over which second differences are taken: short ones are exact without noise, long
 ones contain more of the motion and no more of the noise."""
 WINDOW, FEWEST = 200, 20
-"""Control steps that are compared, at most and at least."""
+"""Largest and least number of control steps that are compared."""
 SURE = 3.5
-"""Standard errors by which one delay must explain the measurements better than another one."""
+"""Number of standard errors by which a delay must explain the measurements better than any
+other."""
 
 
 class DelayEstimate:

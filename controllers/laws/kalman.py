@@ -37,7 +37,8 @@ CAR = LateralModel(
 PROCESS_STD = np.array([0.003, 0.0007, 0.02, 0.02, 0.0005])
 """Standard deviations of the model's error in a control step, at `USUAL_M_S` and above."""
 USUAL_M_S, SLOWEST_SHARE = 15.0, 0.1
-"""Below this speed they fall in proportion, to a tenth: the car and the road then change less."""
+"""Below this speed the standard deviations fall in proportion to it, to a tenth at least: the state
+of a slow car changes less in a control step."""
 START_STD = np.array([0.1, 0.05, 0.1, 0.1, 0.02])
 LEAST_STD = np.array([1e-3, 2e-4, 1e-2, 1e-3])
 MOST_STD = np.array([0.2, 0.02, 0.12, 0.012])
@@ -71,8 +72,8 @@ class StateEstimate:
     def update(self, observation: Observation, wheel_angle: float) -> Vector:
         """The present state (5,) from the observation of this control step.
 
-        `wheel_angle` (rad): of the front wheels since the last control step. A measurement that is
-        not finite counts as unchanged: in the filter it would stay for ever.
+        `wheel_angle`: angle (rad) of the front wheels since the last control step. A measurement
+        that is not finite counts as unchanged, because otherwise it would stay in the filter.
         """
         seen, own = self._measurements(observation)
         self._own[1:] = self._own[:-1].copy()
@@ -152,9 +153,10 @@ def advance(
 ) -> Vector:
     """One control step of the filter; returns the present state (5,).
 
-    `x` (5,) and `covariance` (5, 5), replaced: of the moment of the image, `delay` steps ago. `own`
-    (n, 4): vx, vy, yaw rate and wheel angle, newest first; `seen` (2,): e and theta of the image;
-    `variance` (4,) of the measurements, `process` (5,) of the model.
+    `x` (5,) and `covariance` (5, 5) are the state at the moment of the image, `delay` steps ago;
+    both are replaced. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. `seen` (2,): e
+    and theta of the image. `variance` (4,): of the measurements. `process` (5,): variance of the
+    model's error.
     """
     predict(x, covariance, table, own[delay + 1, 0], own[delay + 1, 3], process)
     correct(x, covariance, VY, own[delay, 1], variance[VY])

@@ -34,7 +34,7 @@ APPROACH_RAD = 0.3
 WEIGHTS, WHEEL_RATE = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01), 3.0
 """The paper's cost, and the weight of the squared change of the wheel angle in a control step."""
 WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0), 0.3
-"""The same until the delay is known."""
+"""The cost and the weight that are used until the delay is known."""
 MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 
 
@@ -124,7 +124,7 @@ class MpcKalman:
 
 
 def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:
-    """K (5,) of change = -K (e1, e1', e2, e2', wheel angle), all from their set points.
+    """The gain K (5,) of change = -K (e1, e1', e2, e2', wheel angle), all minus their set points.
 
     The change of the wheel angle, in rad, is that of one control step of `dt` s at `speed` m/s.
     """

@@ -46,12 +46,12 @@ WEIGHTS_PAPER = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
 """The paper's weights for forza and g-track-3 (second rows of its table)."""
 WEIGHTS_EXACT = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01)
 """Weights of `Lqr` on the exact state: without preview, a higher gain on the offset keeps it small
-in bends (score a step on eroad: 0.9792, with the paper's weights 0.9782)."""
+in bends (score per step on eroad: 0.9792, with the paper's weights 0.9782)."""
 WEIGHTS_PERCEIVED = LqrWeights(5.0, 0.3, 5.0, 0.2, 0.3)
-"""Weights for the errors of the shipped model (score a step on images of g-track-3: 0.9894 with
+"""Weights for the errors of the shipped model (score per step on images of g-track-3: 0.9894 with
 `Lqr`, 0.9877 with `LqrPreview`)."""
 WEIGHTS_BRIEFLY_TRAINED = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0)
-"""Soft weights for the errors of a model trained for minutes (score a step on images of g-track-3
+"""Soft weights for the errors of a model trained for minutes (score per step on images of g-track-3
 with the shipped model: 0.9717)."""
 APPROACH_RAD = 0.15
 """Largest heading error (rad) at which `Lqr` and `LqrPreview` return to the line on perception."""

@@ -6,14 +6,14 @@ gain falls with the variance of the answer. An answer without a standard deviati
 unchanged.
 
 Ordinary answers are not filtered. A filter with their variances reduces the error of the offset by
-30 %, but the score falls from 0.9894 to 0.9881 a step on g-track-3. The reason is the angle: a
+30 %, but the score falls from 0.9894 to 0.9881 per step on g-track-3. The reason is the angle: a
 network's angle turns into a bend before the car reaches it (its error has a correlation of -0.76
 with the change of the curvature over the next 0.4 s), which helps a controller without preview.
 
 With this filter, drives on ordinary images keep their score (0.9894). A camera that fails for 15 %
 of the time, half a second each, throws the car off the road in none of three drives on g-track-3
-(72 km/h); without the filter, in all three. In `town` (50 km/h) the score is 0.956 a step, without
-the filter 0.951.
+(72 km/h); without the filter, in all three. In `town` (50 km/h) the score is 0.956 per step,
+without the filter 0.951.
 """
 
 from dataclasses import dataclass, replace

@@ -36,7 +36,7 @@ class Progress:
     evaluated: int = 0
     """Step of the last drive on the training track."""
     best_score: float = float("-inf")
-    """Best reward a step of these drives."""
+    """Best reward per step of these drives."""
     best_step: int = 0
     """Step of the best drive."""
     curve: list[Row] = field(default_factory=list)

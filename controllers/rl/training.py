@@ -49,8 +49,8 @@ CONFIG, CURVE = "config.json", "curve.csv"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 
 Report = Callable[[int, float], None]
-"""A function that is called with the steps done and the best score a step so far, which is -inf
-before the first drive."""
+"""A function that is called with the number of finished steps and the best score per step so far,
+which is -inf before the first drive."""
 
 
 def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
@@ -145,7 +145,8 @@ class _Training:
         }
 
     def _episode(self) -> None:
-        """One episode, with an update a step once the replay has `learning_starts` transitions."""
+        """One episode; each step is followed by an update once the replay has `learning_starts`
+        transitions."""
         progress, algorithm, agent = self._progress, self._algorithm, self._agent
         rng = np.random.default_rng([self._config.seed, 1, progress.episode])
         paper, _ = self._env.reset(seed=int(rng.integers(2**31)), options=self._start(rng))

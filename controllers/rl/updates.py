@@ -16,7 +16,7 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's usual settings
 
 @dataclass(frozen=True)
 class Batch:
-    """B transitions; no reward follows one that ended its episode."""
+    """B transitions; a transition that ended its episode is followed by no reward."""
 
     states: Array  # (B, state)
     actions: Array  # (B,)
@@ -54,7 +54,7 @@ class Trained:
 def critic_update(
     actor: Trained, critics: Trained, batch: Batch, noise: Array, discount: float
 ) -> float:
-    """Fill the critics' gradients of their mean squared error; returns that error.
+    """Fill the critics' gradients with those of their mean squared error; returns the error.
 
     The target is r + discount min Q'(s', mu'(s') + noise); `noise` is (B,).
     """

@@ -77,7 +77,8 @@ class Sight:
         return None if box is None else [box.left, box.top, box.width, box.height]
 
     def through(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
-        """`image` (H, W, 3) as seen by the model's camera `view`. Raises ImageError."""
+        """Convert `image` (H, W, 3) of this camera to the view of the model's camera: uint8 RGB
+        (view.height, view.width, 3). Raises ImageError."""
         if self.camera is None:
             return crop_and_resize(image, view, self.fov_y_deg)
         return Rectification(self.camera, view).image(image)
@@ -181,7 +182,8 @@ class FrameHandler:
         result: FrameResult,
         span: "Span | None" = None,
     ) -> None:
-        """Count an answer, and log it if `log_answers` is set. `span` is that of its request."""
+        """Count an answer, and log it if `log_answers` is set. `span` is the span of its
+        request."""
         total_s = (time.monotonic_ns() - options.stamp_ns) / 1e9
         self._metrics.count_answer(result, total_s, self.queue.waiting)
         if self._log_answers:
@@ -200,7 +202,7 @@ class FrameHandler:
     def record_problem(
         self, problem: Problem, request_id: str, client: str, span: "Span | None" = None
     ) -> None:
-        """Count and log the problem of a request. `span` is that of the request."""
+        """Count and log the problem of a request. `span` is the span of the request."""
         self.count_refusal(problem, request_id, client)
         if self.tracer is not None:
             self.tracer.record_problem(span, problem, request_id)

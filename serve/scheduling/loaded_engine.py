@@ -9,7 +9,7 @@ from mtlnet.inference.engine import Engine
 
 @dataclass(frozen=True, slots=True)
 class LoadedEngine:
-    """An engine, and the members of every answer that identify the engine and its model."""
+    """An engine, and the members that identify it and its model in every answer."""
 
     engine: Engine
     provenance: dict[str, str]

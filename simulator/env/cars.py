@@ -151,7 +151,7 @@ class Cars:
 
 
 class _Threads:
-    """Runs a compiled function over parts of the cars, one part a thread."""
+    """Runs a compiled function over parts of the cars, one part per thread."""
 
     def __init__(self, count: int) -> None:
         self._count = max(count, 1)

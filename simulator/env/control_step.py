@@ -95,7 +95,7 @@ def observe_cars(
 
 @compiled
 def lend_outputs(outputs: Outputs) -> Outputs:
-    """The same arrays without their counts of references."""
+    """The same arrays without reference counting (`runtime.jit.borrowed`)."""
     states, results, beams, noise = outputs
     return borrowed(states), borrowed(results), borrowed(beams), borrowed(noise)
 

@@ -19,8 +19,9 @@ _ENDINGS = np.array(["", *ENDINGS], object)
 
 
 def vector_info(cars: Cars, frequency_hz: int, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """For each entry of a car's `info` an array (N,), and an array with an underscore before its
-    name: whether each car has it, that is, whether it is `chosen` (N,)."""
+    """For each entry of a car's `info` an array (N,), and a boolean array (N,) named with an
+    underscore before the entry's name: whether each car has the entry, that is, whether it is
+    `chosen` (N,)."""
     rows, results = cars.fleet.cars, cars.results
     track = rows[:, TRACK_AT:]
     steps = rows[:, STEPS].astype(int)

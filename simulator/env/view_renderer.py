@@ -1,4 +1,5 @@
-"""Renders an environment's views with one camera, built on first use; each view once a step."""
+"""Renders an environment's views with one camera, built on first use; each view at most once per
+step."""
 
 import weakref
 from collections.abc import Sequence

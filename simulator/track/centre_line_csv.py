@@ -1,7 +1,7 @@
 """Centre lines as CSV files, read and written.
 
 Read: the format of the TUM racetrack database, `x_m,y_m,w_tr_right_m,w_tr_left_m` (metres, one
-point a row, closed, no heights). Written: `s,x,y,z,ang,curv` (m, rad, 1/m) of any track.
+point per row, closed, no heights). Written: `s,x,y,z,ang,curv` (m, rad, 1/m) of any track.
 """
 
 import math
@@ -32,7 +32,8 @@ PIECE_M: Final = 4.0
 NOISE_M: Final = (0.05, 1.0)
 """Least and largest noise (m, RMS) that is smoothed away; a survey's own noise is estimated."""
 SMOOTHER: Final = 1.2
-"""Factor on the noise's variance: too much smoothing still gives a road, too little wiggles."""
+"""Factor on the noise's variance: too much smoothing still gives a road, too little gives
+wiggles."""
 MIN_RADIUS_M: Final = 5.0
 """A line with a smaller radius is an error of the survey, not a road."""
 MAX_GAP_M: Final = 1e-3

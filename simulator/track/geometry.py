@@ -43,7 +43,7 @@ class TrackPose:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One track. Arrays are (P,), one entry a piece, in driving order; the last piece ends where
+    """One track. Arrays are (P,), one entry per piece, in driving order; the last piece ends where
     the first begins (an imported track may miss it by up to 0.28 m)."""
 
     name: str

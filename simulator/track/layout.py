@@ -1,4 +1,4 @@
-"""Converts straights and bends to pieces: spirals, banking, smooth heights, exact closing.
+"""Converts straights and bends to the pieces of a closed loop, with spirals, banking and heights.
 
 Metres and radians; a bend's angle is left positive; grades are dz/ds.
 """

@@ -1,4 +1,4 @@
-"""Compiled functions on the table of a track: (P, 16), one row a constant-curvature piece.
+"""Compiled functions on the table of a track: (P, 16), one row per constant-curvature piece.
 
 A piece is a straight or an arc of the centre line with edge heights linear in its arc length.
 World frame (x, y plane, z up); s along the centre line, to_middle left positive; metres, radians.
@@ -17,7 +17,7 @@ S0, LENGTH, X0, Y0, HEADING0, CURVATURE = 0, 1, 2, 3, 4, 5
 Z_LEFT0, Z_RIGHT0, Z_LEFT1, Z_RIGHT1 = 6, 7, 8, 9
 HALF_WIDTH, TRACK_LENGTH = 10, 11
 GEOMETRY = 12
-"""The columns so far define the track; the others are computed from them once."""
+"""Number of columns that define the track; the columns after them are computed from these once."""
 COS0, SIN0, LEFT_SLOPE, RIGHT_SLOPE = 12, 13, 14, 15
 COLUMNS = 16
 

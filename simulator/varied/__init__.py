@@ -1,4 +1,4 @@
-"""Varied roads: the values drawn for each round and scene of `--roads varied`; see ranges.toml."""
+"""Varied roads: the random values of each round and scene of `--roads varied`; see ranges.toml."""
 
 ROADS = ("paper", "varied")
-"""Kinds of roads: "paper" has lanes of 4.0 m and the tracks' own paint, "varied" is drawn."""
+"""Kinds of roads: "paper" has lanes of 4.0 m and the tracks' own paint, "varied" random values."""

@@ -54,7 +54,8 @@ class Marking:
 
 @dataclass(frozen=True, slots=True)
 class Carriageway:
-    """The drawn values of one round's road, apart from its track."""
+    """The random values of one round's road: lanes, shoulders, camera height and markings. The
+    track is chosen separately."""
 
     lane_width_m: float
     shoulders_m: tuple[float, float]

@@ -1,4 +1,4 @@
-"""The drawn values of one scene of `--roads varied`; a scene of `--roads paper` has no look."""
+"""The random values of one scene of `--roads varied`; a scene of `--roads paper` has no look."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any

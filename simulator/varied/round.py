@@ -1,4 +1,4 @@
-"""The drawn values of one round of `--roads varied`: its road, and the look of each scene."""
+"""The random values of one round of `--roads varied`: its road, and the look of each scene."""
 
 from dataclasses import dataclass
 from typing import Any

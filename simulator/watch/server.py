@@ -1,4 +1,4 @@
-"""The web server of a watched drive: one page, and one WebSocket a browser.
+"""The web server of a watched drive: one page, and one WebSocket per browser.
 
 A thread of its own, so that the drive keeps the main thread.
 """

@@ -1,6 +1,6 @@
 """The control step of cars that touch nothing, compiled, over the rows of a `fleet`.
 
-A car that touches something stops at that physics step: `World.complete` goes on with it.
+A car that touches something stops at that physics step; `World.complete` then moves it.
 """
 
 from runtime.jit import borrowed, compiled, compiled_for_threads
@@ -35,7 +35,7 @@ from simulator.world.free_motion import advance_free
 
 @compiled
 def lend(fleet: Arrays) -> Arrays:
-    """The same arrays without their counts of references."""
+    """The same arrays without reference counting (`runtime.jit.borrowed`)."""
     cars, params, other, tables, left, right, roads, others, move = fleet
     return (
         borrowed(cars),
@@ -52,7 +52,7 @@ def lend(fleet: Arrays) -> Arrays:
 
 @compiled
 def lend_work(work: Work) -> Work:
-    """The same arrays without their counts of references."""
+    """The same arrays without reference counting (`runtime.jit.borrowed`)."""
     axes, wheels, slip_gain, velocity, turned, wrench = work
     return (
         borrowed(axes),

@@ -1,4 +1,4 @@
-"""Cars and roads as arrays for compiled code: one row a car, one row a road.
+"""Cars and roads as arrays for compiled code: one row per car, one row per road.
 
 A control step reads and writes these arrays only, so that one compiled call can step many cars.
 World frame and SI units, as in `world`. Counts and codes are stored as floats.

@@ -29,8 +29,9 @@ TRIES = 12
 
 @dataclass(frozen=True)
 class Bridge:
-    """One bridge: its place, heading of the road below, triangles (n, 12) in the world, and the
-    boxes (m, 2, 3), least and greatest corner in its own frame, that cast its shadow."""
+    """One bridge: its place, the heading of the road below, its triangles (n, 12) in the world, and
+    the boxes that cast its shadow (m, 2, 3): least and greatest corner of each in the bridge's
+    frame."""
 
     s: float
     place: FloatArray

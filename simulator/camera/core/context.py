@@ -2,8 +2,8 @@
 
 Any thread can draw; only one thread draws at a time (see `turns`).
 
-On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the context is made, sets
-the drawing threads: 0 draws in the calling thread, which suits one worker process a core.
+On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the context is made, sets the
+drawing threads: 0 draws in the calling thread, which suits one worker process per core.
 """
 
 import atexit

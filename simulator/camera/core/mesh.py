@@ -40,7 +40,8 @@ class Chunks:
 
 
 class Mesh:
-    """One indexed vertex array with its chunks. `layout` is moderngl's format and names."""
+    """One indexed vertex array and its chunks, the parts that culling draws or skips. `layout` is
+    the vertex format and the attribute names, as moderngl takes them."""
 
     def __init__(
         self,

@@ -18,7 +18,8 @@ Picture = NDArray[np.uint8]
 STAGES = 3
 """Number of steps in which drops gather between two strokes of the wiper."""
 SMALL = 4
-"""Divisor of the small picture that drops show; they show it so small that it is sharp enough."""
+"""Factor by which the picture seen through drops is reduced; drops show it so small that this
+resolution is enough."""
 SWEEP = 0.3
 """Share of a wiper's period that its stroke takes."""
 MOST_DROPS = 400

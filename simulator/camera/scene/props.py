@@ -218,7 +218,8 @@ def build(
     rng: np.random.Generator,
     lit_every_m: float = 0.0,
 ) -> dict[str, Surface]:
-    """All props and bridges of a scene by material; lit lamps stand right, every `lit_every_m`."""
+    """All props and bridges of a scene by material; lit lamps stand on the right, every
+    `lit_every_m`."""
     placer = _Placer(ground, bridges)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)

@@ -15,7 +15,7 @@ SECTORS = 12
 _ROWS = ((-90, 0.0), (-8, 0.02), (12, 0.32), (45, 0.70), (90, 1.0))
 """Elevation (deg) and height in the panorama of the dome's rows: finest over the horizon."""
 _SHARPNESS = 0.9
-"""Texels of the panorama per pixel in the middle of the picture, about."""
+"""Approximate number of texels of the panorama per pixel in the middle of the picture."""
 _WIDTHS = (1024, 4096)
 
 

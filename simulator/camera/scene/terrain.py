@@ -127,7 +127,8 @@ class Terrain:
     """Height of the sea level; -inf without a sea."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height at points, interpolated on the triangles that are drawn."""
+        """Height in m at world places x, y in m (arrays of one shape), interpolated on the
+        triangles that are drawn."""
         grid = self.grid
         return between(self.z, (x - grid.x0) / grid.cell, (y - grid.y0) / grid.cell)
 

@@ -70,7 +70,7 @@ def _by_night(light: Light, look: Lighting) -> Light:
 
 
 def _with_low_sun(light: Light, elevation_deg: float) -> Light:
-    """`light` with the sun lower, and so redder and dimmer, than the kind of light has it."""
+    """`light` with a lower sun, which is also redder and dimmer."""
     elevation = min(math.radians(elevation_deg), light.sun_elevation)
     clear = math.sin(elevation) / math.sin(max(light.sun_elevation, elevation))
     red, green, blue = light.sun

@@ -86,8 +86,8 @@ def plant(
 
 
 Sites = tuple[FloatArray, FloatArray, NDArray[np.str_], FloatArray, FloatArray]
-"""Of N trees: s, offset, kind, size (0 to 1 of its kind's heights), and how far their crowns may
-reach over the asphalt."""
+"""N trees: s, offset, kind, size (0 to 1: least to greatest height of the kind), and how far the
+crown may reach over the asphalt."""
 
 
 def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:

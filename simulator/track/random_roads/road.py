@@ -1,7 +1,7 @@
 """Random roads: the track `random:SEED`, a function of its seed.
 
-Errors of the heading are largest, and biased, in tight bends and at changes of curvature. Other
-tracks show these in few frames, the drive on a random road in half of its frames.
+Errors of the angle are largest, and biased, in tight bends and at changes of curvature. Few frames
+of other tracks show these; on random roads half of the frames do.
 
 The road is drawn as the content of a TOML file (see `toml_track`), in decimals: the same seed gives
 the same decimals on every machine (numpy's PCG64; rounding to decimals removes the differences of
