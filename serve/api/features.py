@@ -57,7 +57,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class ImageCamera:
     """The camera of an image: `camera`, if given; else the model's camera, with the vertical field
     of view `fov_y_deg` if given."""
 
@@ -76,7 +76,7 @@ class Sight:
         box = crop_box(width, height, view, self.fov_y_deg)
         return None if box is None else [box.left, box.top, box.width, box.height]
 
-    def through(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
+    def to_model_view(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
         """Convert `image` (H, W, 3) of this camera to the view of the model's camera: uint8 RGB
         (view.height, view.width, 3). Raises ImageError."""
         if self.camera is None:
@@ -117,31 +117,31 @@ class FrameHandler:
         Returns `crop_px` of the answer. Raises Problem, ImageError.
         """
         self.queue.check_ready()
-        camera, sight = self.queue.loaded.engine.card.camera, self.sight(options)
+        camera, source = self.queue.loaded.engine.card.camera, self.image_camera(options)
         header = read_header(body)
-        crop = sight.crop_px(header.width, header.height, camera)
+        crop = source.crop_px(header.width, header.height, camera)
         small = header.width * header.height <= SMALL_PIXELS and header.decode_ms <= SMALL_MS
         small = small and (len(body) <= SMALL_BYTES or header.png_header is not None)
 
         def read(view: CameraParameters) -> NDArray[np.uint8]:
-            return sight.through(decode_whole(body, header), view)
+            return source.to_model_view(decode_whole(body, header), view)
 
-        frame = _frame(options, client, read, header.decode_ms, small, sight)
+        frame = _frame(options, client, read, header.decode_ms, small, source)
         self.queue.submit(frame, on_result)
         return crop
 
-    def sight(self, options: RequestOptions) -> Sight:
+    def image_camera(self, options: RequestOptions) -> ImageCamera:
         """The camera of a request's image. Raises Problem for an unknown camera."""
         name = options.camera
         if name is None:
-            return Sight(options.fov_y_deg)
+            return ImageCamera(options.fov_y_deg)
         if options.fov_y_deg is not None:
             seen = f"{CAMERA} and {FIELD_OF_VIEW} are both given"
             raise Problem(INVALID_REQUEST, f"{seen}; the camera has a field of view, so send one")
         if name not in self.cameras:
             known = ", ".join(self.cameras) or "none (serve --camera NAME=FILE gives it one)"
             raise Problem(INVALID_REQUEST, f"{CAMERA} is {name[:80]!r}; the service knows {known}")
-        return Sight(None, self.cameras[name])
+        return ImageCamera(None, self.cameras[name])
 
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
@@ -165,7 +165,7 @@ class FrameHandler:
         Raises Problem, ImageError.
         """
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
-        frame = _frame(options, client, read, read_ms, False, self.sight(options))
+        frame = _frame(options, client, read, read_ms, False, self.image_camera(options))
         self.queue.submit(frame, partial(resolve, future))
         del read, frame
         try:
@@ -323,11 +323,11 @@ def _frame(
     read: PixelReader,
     read_ms: float,
     small: bool,
-    sight: Sight,
+    source: ImageCamera,
 ) -> Frame:
     stream = stream_key(client, options.stream) if options.stream else 0
     return Frame(
-        read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms, sight.camera
+        read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms, source.camera
     )
 
 

@@ -26,7 +26,7 @@ from mtlnet.inference.image_decoding.decode import check_size, decode_whole, rea
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import Prediction
 from mtlnet.inference.uncertainty import FEATURES
-from serve.api.features import FrameHandler, Sight
+from serve.api.features import FrameHandler, ImageCamera
 from serve.api.kserve_tensors import (
     PAUSE_S,
     WINDOW_BYTES,
@@ -185,7 +185,7 @@ async def _answer(
                 options = parse_options(headers, stamp_ns, request_id, KSERVE_FORMATS)
             share.grow(len(infer_request.input.data))  # a copy; freed after decoding
             read, read_ms = await _pixel_reader(
-                infer_request, binary, frames, frames.sight(options)
+                infer_request, binary, frames, frames.image_camera(options)
             )
             infer_request.input.data = b""
             del body, binary
@@ -207,7 +207,7 @@ async def _answer(
 
 
 async def _pixel_reader(
-    request: InferRequest, binary: memoryview, frames: FrameHandler, sight: Sight
+    request: InferRequest, binary: memoryview, frames: FrameHandler, source: ImageCamera
 ) -> tuple[PixelReader, float]:
     """A function that reads the input's pixels, and the estimate of its time in ms.
 
@@ -225,12 +225,12 @@ async def _pixel_reader(
     if tensor.name == "image":
         body = await read_image_bytes(tensor, binary)
         header = read_header(body)
-        sight.crop_px(header.width, header.height, camera)
-        return lambda view: sight.through(decode_whole(body, header), view), header.decode_ms
+        source.crop_px(header.width, header.height, camera)
+        return lambda view: source.to_model_view(decode_whole(body, header), view), header.decode_ms
     pixels = find_pixels(tensor, binary)
     check_size(pixels.width, pixels.height)
-    sight.crop_px(pixels.width, pixels.height, camera)
-    return lambda view: sight.through(pixels.read(), view), pixels.read_ms
+    source.crop_px(pixels.width, pixels.height, camera)
+    return lambda view: source.to_model_view(pixels.read(), view), pixels.read_ms
 
 
 def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:
