@@ -21,8 +21,9 @@ Config = TypeVar("Config")
 
 ControllerName = Annotated[
     str,
-    "Controller: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, rl, rl-residual, torcs, a folder "
-    "of `controllers train`, or a class of your own as MODULE:CLASS or FILE.py:CLASS.",
+    "Controller: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, lqr-kalman, mpc-kalman, rl, "
+    "rl-residual, torcs, a folder of `controllers train`, or a class of your own as MODULE:CLASS "
+    "or FILE.py:CLASS.",
 ]
 Controllers = Annotated[
     str, "Controllers, separated by commas, as in `controllers drive --controller`."
@@ -45,7 +46,7 @@ Light = Annotated[
 ]
 Parameters = Annotated[
     Path | None,
-    "File of `controllers tune` with parameters of controllers. Default: parameters of their own.",
+    "File written by `controllers tune`. Default: each controller's own parameters.",
 ]
 Reward = Annotated[
     str, "paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2), the paper's second reward."

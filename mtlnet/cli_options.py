@@ -91,20 +91,25 @@ RefitData = Annotated[
 ShippedEvaluations = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Output of `mtlnet evaluate --json` for README.md; may be given several times.",
+        help="File with the output of `mtlnet evaluate --json`, whose figures README.md shows; may "
+        "be given several times.",
         show_default="none",
     ),
 ]
 ShippedNotes = Annotated[
     Path | None,
     typer.Option(
-        help="Markdown file for README.md, such as the commands.", exists=True, show_default="none"
+        help="Markdown file to include in README.md, for example the commands of the training.",
+        exists=True,
+        show_default="none",
     ),
 ]
 ShippedPicture = Annotated[
     Path | None,
     typer.Option(
-        help="JPEG of `mtlnet evaluate --worst` for README.md.", exists=True, show_default="none"
+        help="JPEG of `mtlnet evaluate --worst` to show in README.md.",
+        exists=True,
+        show_default="none",
     ),
 ]
 
@@ -168,14 +173,14 @@ PredictCamera = Annotated[
     Path | None,
     typer.Option(
         help="Camera file (YAML) of the pictures, or `model` for the model's camera.",
-        show_default="the one that a recording states or a film or stream shows, else the model's",
+        show_default="that of a recording, or estimated from a film or stream; else the model's",
     ),
 ]
 Topic = Annotated[
     str,
     typer.Option(
         help="Topic of a Foxglove file or ROS 2 bag that holds the pictures.",
-        show_default="the only one with pictures",
+        show_default="the only topic with pictures",
     ),
 ]
 
@@ -195,7 +200,8 @@ LabelCamera = Annotated[
 NoModel = Annotated[
     bool,
     typer.Option(
-        "--no-model", help="Start each picture in the middle of a lane, not at a model's answer."
+        "--no-model",
+        help="Start with the car in the middle of a lane instead of with a model's answer.",
     ),
 ]
 LabelHost = Annotated[

@@ -50,10 +50,10 @@ def snapshot(
     lanes: Lanes = 2,
     lane_width: Annotated[
         float | None,
-        typer.Option(help="Lane width, m, 2.7 to 4.5. Default: 4.0; varied roads draw it."),
+        typer.Option(help="Lane width, m, 2.7 to 4.5. Default: 4.0, random on varied roads."),
     ] = None,
     roads: Annotated[
-        str, typer.Option(help="paper, or varied: lanes, paint and look are drawn from --seed.")
+        str, typer.Option(help="paper, or varied: random lanes, paint and look, by --seed.")
     ] = "paper",
     seed: Annotated[int, typer.Option(help="Seed of scenery, light and places.", min=0)] = 0,
     traffic: Traffic = 3,

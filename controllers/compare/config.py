@@ -52,7 +52,9 @@ class TuneConfig:
 
     out: Annotated[Path, "File for the parameters found."] = Path("tuned.json")
     controllers: Annotated[
-        str, "Controllers, separated by commas: lqr, lqr-preview, lqr-paper, mpc, mpc-preview."
+        str,
+        "Controllers, separated by commas: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, "
+        "lqr-kalman, mpc-kalman.",
     ] = "lqr,mpc"
     tracks: options.Tracks = "forza"
     budget: Annotated[

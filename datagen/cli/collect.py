@@ -62,7 +62,9 @@ ShardOf = Annotated[
 ]
 ExecutorName = Annotated[
     str,
-    typer.Option(help="local, or ray: the cluster at $RAY_ADDRESS, or one on this machine."),
+    typer.Option(
+        help="local: processes of this machine. ray: the Ray cluster at $RAY_ADDRESS, or a new one."
+    ),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; record nothing.")]
 
@@ -168,7 +170,9 @@ def record_plan(
 
 
 def merge(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of shards.")],
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Dataset folders to merge.")
+    ],
     out: Annotated[Path, typer.Option(help="Dataset folder to create or to add to.")],
     as_json: AsJson = False,
 ) -> None:

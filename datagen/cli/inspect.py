@@ -21,7 +21,7 @@ DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset fo
 
 
 def info(folder: DatasetFolder = DATASET_FOLDER, as_json: AsJson = False) -> None:
-    """Count the contents of a dataset, and the error of a model that always predicts the mean."""
+    """Print the contents of a dataset, and the errors of always predicting the mean label."""
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
 
@@ -73,7 +73,9 @@ def export(
     shard_size: Annotated[int, typer.Option(help="webdataset: frames per shard.")] = 1000,
     shuffle: Annotated[
         bool,
-        typer.Option("--shuffle", help="webdataset: a fixed random order, not the order of time."),
+        typer.Option(
+            "--shuffle", help="webdataset: frames in a fixed random order instead of in time."
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -178,7 +178,7 @@ class ProtocolConfig:
     Raises UserError for drives of no length."""
 
     rounds: Annotated[int, Option(help="Rounds on the nine tracks.")] = 15
-    frames: Annotated[int, Option(help="Frames of each of these rounds.")] = 2000
+    frames: Annotated[int, Option(help="Frames per round on the nine tracks.")] = 2000
     laps: Annotated[float, Option(help="Laps of each of the four drives.")] = 1.0
     seed: Seed = 1810
 

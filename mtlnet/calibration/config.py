@@ -21,7 +21,7 @@ class CalibrateConfig:
         Option(
             help="Board in the pictures: inner corners of a chessboard (9x6), or a ChArUco board "
             "as charuco:5x7:4X4_50:0.75 (squares, dictionary, side of a marker in squares).",
-            show_default="a chessboard, its corners counted",
+            show_default="a chessboard; its corners are counted",
         ),
     ] = ""
     fisheye: Annotated[
@@ -32,7 +32,10 @@ class CalibrateConfig:
     ] = False
     camera: Annotated[
         Path | None,
-        Option(help="Camera file with the lens, for example of a board.", show_default="none"),
+        Option(
+            help="Camera file with the lens, for example as calibrated with a board.",
+            show_default="none",
+        ),
     ] = None
     fov_y_deg: Annotated[
         float | None,

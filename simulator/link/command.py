@@ -29,7 +29,7 @@ Realtime = Annotated[
     bool,
     typer.Option(
         "--realtime/--lock-step",
-        help="Step by the wall clock and hold the last command, or wait for a command each step.",
+        help="Step by the wall clock and hold the last command, or wait for each command.",
     ),
 ]
 Once = Annotated[bool, typer.Option("--once", help="End when the first client disconnects.")]

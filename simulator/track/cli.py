@@ -52,7 +52,7 @@ def list_all(
 def plot(
     context: typer.Context,
     track: TrackName,
-    out: Annotated[Path | None, typer.Option(help="PNG file; NAME.png here if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="PNG file to write. Default: NAME.png.")] = None,
     lanes: Lanes = 1,
     tracks_dir: TracksDir = None,
 ) -> None:
@@ -69,9 +69,11 @@ def plot(
 
 @tracks.command()
 def export(
-    road: Annotated[str, typer.Argument(metavar="random:SEED", help="Name of a random road.")],
+    road: Annotated[
+        str, typer.Argument(metavar="random:SEED", help="Name of a random road: random:SEED.")
+    ],
     out: Annotated[
-        Path | None, typer.Option(help="TOML file; random-SEED.toml here if not given.")
+        Path | None, typer.Option(help="TOML file to write. Default: random-SEED.toml.")
     ] = None,
 ) -> None:
     """Write a random road as a TOML track, which can be edited and driven by its path."""

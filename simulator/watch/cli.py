@@ -40,7 +40,9 @@ def watch(
     port: Annotated[
         int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)
     ] = WatchConfig.port,
-    speed: Annotated[float, typer.Option(help="Multiple of real time.")] = WatchConfig.speed,
+    speed: Annotated[
+        float, typer.Option(help="Speed of the drive as a multiple of real time.")
+    ] = WatchConfig.speed,
     seed: Annotated[
         int, typer.Option(help="Seed of scenery, light and traffic.", min=0)
     ] = WatchConfig.seed,
