@@ -1,8 +1,9 @@
 """The simulated car against the real TORCS: same control law, same tracks, the flying lap.
 
 Run: `TORCS_TRACKS=FOLDER python benchmarks/torcs_fit.py [--json FILE]`; FOLDER holds `tracks/` and
-the reference laps `drives/NAME-lqr.csv`. Limits: steps within 1 %, score a step within 0.004, mean
-|d| within 0.02 m, max |d| within 0.15 m. Exit code 1 when one is missed, 3 without reference laps.
+the reference laps `drives/NAME-lqr.csv`. Limits: steps within 1 %, score per step within 0.004,
+mean |d| within 0.02 m, max |d| within 0.15 m. Exit code 1 when one is missed, 3 without reference
+laps.
 """
 
 import os

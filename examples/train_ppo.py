@@ -15,7 +15,7 @@ from simulator.env.stable_baselines import StableBaselinesCars
 
 
 class Scores(BaseCallback):
-    """Collects the mean reward a step of each episode that ends."""
+    """Collects the mean reward per step of each episode that ends."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Scores(BaseCallback):
 
 
 def train(steps: int, cars: int) -> tuple[float, float]:
-    """Mean score a step of the first and of the last tenth of the episodes."""
+    """Mean score per step of the first and of the last tenth of the episodes."""
     envs = StableBaselinesCars(
         cars,
         track="random",
