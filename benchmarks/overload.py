@@ -1,15 +1,15 @@
-"""What the service does with five times the frames it can answer, and with 1,000 slow connections.
+"""The service under five times the load that it can answer, and with 1,000 slow connections.
 
-One worker on one core, a compiled load generator on the other. First one client alone, then as many
-as keep the engine busy (the peak), then frames that come at five times that rate whatever becomes
-of them; last four clients at a fifth of the peak, without and with 1,000 others that never end what
-they send. With a peer's interpreter its figures on the same script stand beside ours.
+One worker runs on one core, a compiled load generator on another core. The loads: one client alone;
+as many clients as keep the engine busy (the peak); frames at five times the peak rate, sent whether
+or not earlier frames were answered; four clients at a fifth of the peak rate, without and with
+1,000 other connections whose requests never end. Each given peer is measured by the same script.
 
     python benchmarks/overload.py [--litserve PYTHON] [--bentoml PYTHON] [--mosec PYTHON]
         [--model RUN] [--int8] [--seconds 30] [--out FILE]
-    claims, for ours: admitted p99 at most twice the p99 of one client alone plus the time of a full
-    queue; answers at least 0.95 of the peak; p99 of refusals at most 5 ms; with slow connections
-    the others' p99 at most doubles, and none of them is refused or cut
+    claims, for our service: p99 of admitted frames at most twice the p99 of one client alone plus
+    the time of a full queue; answers at least 0.95 of the peak; p99 of refusals at most 5 ms; slow
+    connections at most double the p99 of the four clients, none of whose requests fails
 """
 
 import os
@@ -25,12 +25,20 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.claims.outcome import conclude, run_command
-from benchmarks.service_load.servers import HERE, OURS, Loader, Peer, model_copy, pythons, running
+from benchmarks.service_load.servers import (
+    HERE,
+    OURS,
+    ComparisonOptions,
+    Loader,
+    model_copy,
+    running,
+)
+from runtime.options import options_of
 from serve.config import Limits
 
 OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
-BUSY = 4  # clients that keep one worker busy, and whom its queue holds
-CONNECTIONS = 64  # over which the frames come that are too many
+BUSY = 4  # clients that keep one worker busy; its queue has room for their frames
+CONNECTIONS = 64  # of the load generator under overload
 SLOW = 1000
 SETTLE_S = 3.0
 SERVER, CLIENTS = {0}, {1}  # cores
@@ -95,19 +103,15 @@ def judge(found: dict[str, Any]) -> dict[str, bool]:
     }
 
 
-def main(
-    litserve: Peer = None,
-    bentoml: Peer = None,
-    mosec: Peer = None,
-    model: Path | None = None,
-    int8: bool = False,
-    seconds: float = 30.0,
-    out: Path | None = None,
-) -> None:
+@options_of(ComparisonOptions)
+def main(options: ComparisonOptions, seconds: float = 30.0, out: Path | None = None) -> None:
     result: dict[str, Any] = {}
-    with model_copy(model, int8) as folder, tempfile.TemporaryDirectory() as temporary:
+    with (
+        model_copy(options.model, options.int8) as folder,
+        tempfile.TemporaryDirectory() as temporary,
+    ):
         loader = Loader(Path(temporary), CLIENTS)
-        for name, python in pythons(litserve, bentoml, mosec).items():
+        for name, python in options.pythons().items():
             with running(name, python, folder, 1, SERVER) as port:
                 found = overload(loader, port, seconds)
                 rate = found["peak_per_second"] / 5

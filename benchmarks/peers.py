@@ -1,12 +1,12 @@
 """The service against LitServe, BentoML and mosec, on one model: time of a request, throughput.
 
-Each answers the same JPEG by POST with the same JSON, from the same weights on OpenVINO in the same
-precision, an engine of one thread a worker; each as its own manual advises
-(`service_load/peer_*.py`).
-First all run at once with one worker and are asked in turns over one connection; then, one after
-another, in turns again, each with two workers by eight clients that ask as soon as they have their
-answer. A peer is an environment of its own with it, openvino, numpy and simplejpeg; one that is not
-given is skipped.
+Each server answers the same JPEG by POST with the same JSON, from the same weights on OpenVINO in
+the same precision, with an engine of one thread per worker. Each is set up as its own manual
+advises (`service_load/peer_*.py`).
+Time of a request: all servers run at once with one worker each, and get requests in turns over one
+connection. Throughput: the servers run one after another with two workers each, in several turns;
+eight clients send their next request as soon as they have an answer. Each peer needs a Python
+environment with the peer, openvino, numpy and simplejpeg; a peer that is not given is skipped.
 
     python benchmarks/peers.py --litserve PYTHON --bentoml PYTHON --mosec PYTHON
         [--model RUN] [--int8] [--requests 2000] [--seconds 10] [--turns 3] [--out FILE]
@@ -28,16 +28,16 @@ from benchmarks.service import TURN, connect, exchange
 from benchmarks.service_load.servers import (
     OURS,
     PEERS,
+    ComparisonOptions,
     Loader,
-    Peer,
     model_copy,
-    pythons,
     request,
     running,
 )
+from runtime.options import options_of
 
 CLAIMS = {"litserve": (0.75, 1.5), "bentoml": (0.65, 1.8), "mosec": (1.0, 1.0)}
-"""Our p50 at most so many times theirs, our throughput at least so many times theirs."""
+"""For each peer: our p50 over its p50, at most; our throughput over its throughput, at least."""
 CLIENTS, WORKERS = 8, 2
 
 
@@ -92,21 +92,18 @@ def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str
     return {"our_ratios": [p50, rate], "claims": [slowest, fewest], "held": held}
 
 
+@options_of(ComparisonOptions)
 def main(
-    litserve: Peer = None,
-    bentoml: Peer = None,
-    mosec: Peer = None,
-    model: Path | None = None,
-    int8: bool = False,
+    options: ComparisonOptions,
     requests: int = 2_000,
     seconds: float = 10.0,
     turns: int = 3,
     out: Path | None = None,
 ) -> None:
-    servers = pythons(litserve, bentoml, mosec)
+    servers = options.pythons()
     if list(servers) == [OURS]:
         not_measured("give at least one peer, e.g. --litserve PYTHON")
-    with model_copy(model, int8) as folder:
+    with model_copy(options.model, options.int8) as folder:
         times = latency(servers, folder, requests)
         rates = throughput(servers, folder, seconds, turns)
     figures = {name: {"p50_ms": median(times[name]), **rates[name]} for name in servers}

@@ -16,9 +16,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from typer import Option
 
 from benchmarks.service_load.peer_work import MODEL, PORT, WORKERS
 from tests.serve.conftest import jpeg, picture, publish_untrained
@@ -27,8 +29,6 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 OURS = "driverview"
 PEERS = ("litserve", "bentoml", "mosec")
-Peer = Path | None
-"""The interpreter of an environment that has the peer; None: it is left out."""
 START_S, END_S = 120.0, 10.0
 BODY = jpeg(picture())
 
@@ -39,10 +39,20 @@ def request(path: str = "/features") -> bytes:
     return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
 
 
-def pythons(*peers: Path | None) -> dict[str, Path]:
-    """The interpreter of each server: ours, and those given for `PEERS`, in their order."""
-    given = {name: path for name, path in zip(PEERS, peers, strict=True) if path}
-    return {OURS: Path(sys.executable), **given}
+@dataclass(frozen=True)
+class ComparisonOptions:
+    """Options of a benchmark that compares the service with `PEERS`: the peers and the model."""
+
+    litserve: Annotated[Path | None, Option(help="Python of an environment with LitServe.")] = None
+    bentoml: Annotated[Path | None, Option(help="Python of an environment with BentoML.")] = None
+    mosec: Annotated[Path | None, Option(help="Python of an environment with mosec.")] = None
+    model: Annotated[Path | None, Option(help="Folder of a run.", show_default="untrained")] = None
+    int8: Annotated[bool, Option("--int8", help="Serve the int8 graph of the run.")] = False
+
+    def pythons(self) -> dict[str, Path]:
+        """The interpreter of each server: ours, and those given for `PEERS`, in their order."""
+        given = {name: getattr(self, name) for name in PEERS if getattr(self, name)}
+        return {OURS: Path(sys.executable), **given}
 
 
 @contextmanager

@@ -74,8 +74,13 @@ def test_the_unspecified_ipv6_address_takes_both_families() -> None:
     with ExitStack() as stack:
         (listener,) = bind_all("::", 0)
         stack.enter_context(listener).listen()
+        clients = []
         for name in FAMILIES:
             socket.create_connection((name, listener.getsockname()[1]), 5).close()
+            connection, address = listener.accept()
+            connection.close()
+            clients.append(address[0])
+        assert sorted(clients) == ["::1", "::ffff:127.0.0.1"]
 
 
 @pytest.mark.parametrize("missing", FAMILIES.values())
