@@ -16,7 +16,7 @@ from datagen.recording.images import encode
 from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.run import predict_files
-from tests.mtlnet.predict.test_predict import BrightnessEngine, write_film, write_jpeg
+from tests.mtlnet.predict.brightness_engine import BrightnessEngine, write_film, write_jpeg
 from trackfeatures.camera import CameraParameters
 
 EPOCH_NS = 1_577_836_800_000_000_000

@@ -18,7 +18,7 @@ from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.sources import streams
 from mtlnet.sources.streams import is_live, shown_name
-from tests.mtlnet.predict.test_predict import BrightnessEngine
+from tests.mtlnet.predict.brightness_engine import BrightnessEngine
 from trackfeatures.errors import UserError
 
 COUNT, STALL_S = 8, 1.0
