@@ -27,7 +27,7 @@ from datagen.driving.scripted_driver import ScriptedDriver
 from datagen.driving.trajectory import make_course
 from mtlnet.calibration.drive import calibrate_film, calibrate_pictures
 from mtlnet.calibration.lens import Lens, find_lens
-from runtime.film import Film
+from runtime.film import Mp4Writer
 from simulator.camera import Camera, Light
 from simulator.camera.core.optics import rotation
 from simulator.track.catalogue import find_track
@@ -93,7 +93,7 @@ def render_film(mount: Mount, path: Path, seconds: float, seed: int) -> None:
     with (
         World(road, traffic=4, frequency_hz=FPS * 2) as world,
         Camera(road, lens, seed=seed, light=light) as camera,
-        Film(path, FPS) as film,
+        Mp4Writer(path, FPS) as film,
     ):
         s = mount.start * road.track.length_m
         state = world.reset(seed=seed, s=s, speed=driver.speed_at(s), to_middle=driver.offset_at(0))

@@ -21,7 +21,7 @@ from mtlnet.predict.lenses import with_lens
 from mtlnet.predict.run import answer, first_of
 from mtlnet.predict.writers import draw_prediction
 from mtlnet.sources.find import Source, find_sources
-from mtlnet.sources.kinds import Kind
+from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens, Picture, fit
 from mtlnet.sources.read import SourceImage, read_sources
 from trackfeatures.camera import CameraParameters
@@ -137,7 +137,7 @@ class Model:
         lens = self._lens(camera, fov_y_deg)
         if isinstance(source, str | Path):
             sources = find_sources([str(source)], log.info, topic)
-            if [(s.path, s.kind) for s in sources] != [(Path(source), Kind.IMAGE)]:
+            if [(s.path, s.kind) for s in sources] != [(Path(source), SourceKind.IMAGE)]:
                 return self._all(sources, lens, calibrate=camera is None)
             if sources[0].problem:
                 raise UserError(sources[0].problem)

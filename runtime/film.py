@@ -15,7 +15,7 @@ FILM_SUFFIX = ".mp4"
 BOX_HEAD = 8
 
 
-class Film:
+class Mp4Writer:
     """A film of `fps` images per second; it can be played even if the command is interrupted.
 
     The first image sets the film's size. Use it as a context manager, which closes the file. Raises

@@ -18,7 +18,7 @@ LOG_FLOOR = 1e-9
 MAX_POINTS = 800
 """Largest useful number of points of a line on a page."""
 
-Numbers = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Axis:
     last: float
     log: bool = False
 
-    def __call__(self, values: ArrayLike) -> Numbers:
+    def __call__(self, values: ArrayLike) -> FloatArray:
         first, last, here = (
             np.log10(np.maximum(v, LOG_FLOOR)) if self.log else np.asarray(v, np.float64)
             for v in (self.first, self.last, values)
@@ -45,7 +45,7 @@ class Axis:
         )
 
 
-def value_range(columns: Iterable[Numbers], *, log: bool) -> tuple[float, float]:
+def value_range(columns: Iterable[FloatArray], *, log: bool) -> tuple[float, float]:
     """Smallest and largest finite value of `columns`, with a margin, for an axis."""
     values = np.concatenate([column[np.isfinite(column)] for column in columns])
     if not len(values):
@@ -89,11 +89,11 @@ class Line:
     """
 
     kind: str
-    x: Numbers
-    y: Numbers
+    x: FloatArray
+    y: FloatArray
     label: str = ""
     colour: str = ""
-    band: tuple[Numbers, Numbers] | None = None
+    band: tuple[FloatArray, FloatArray] | None = None
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def line_plot(plot: Plot) -> Markup:
     return _figure(plot.title, drawn, labels, plot.x_unit, legend=_legend(plot.lines))
 
 
-def reliability_diagram(title: str, predicted: Numbers, observed: Numbers) -> Markup:
+def reliability_diagram(title: str, predicted: FloatArray, observed: FloatArray) -> Markup:
     """Observed errors over predicted standard deviations (both (N,)), on logarithmic axes with the
     diagonal."""
     both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
@@ -167,7 +167,7 @@ def _band(x_axis: Axis, y_axis: Axis, line: Line) -> str:
     return f'<path class=band{_colour("fill", line)} d="{path}"/>'
 
 
-def _points(x_axis: Axis, y_axis: Axis, x: Numbers, y: Numbers) -> list[str]:
+def _points(x_axis: Axis, y_axis: Axis, x: FloatArray, y: FloatArray) -> list[str]:
     return [f"{a:.1f},{b:.1f}" for a, b in zip(x_axis(x), y_axis(y), strict=True)]
 
 
@@ -181,7 +181,7 @@ def _colour(style: str, line: Line) -> str:
     return f' style="{style}:{line.colour}"' if line.colour else ""
 
 
-def _tick_label(side: str, place: Numbers, value: float) -> str:
+def _tick_label(side: str, place: FloatArray, value: float) -> str:
     edge = "top" if side == "y" else "left"
     return f'<span class={side} style="{edge}:{100 * place / SIDE:.1f}%">{value:g}</span>'
 
@@ -266,7 +266,7 @@ def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
     )
 
 
-def _outline(share: Numbers, colour: str) -> str:
+def _outline(share: FloatArray, colour: str) -> str:
     """A step outline of the bin heights `share` (BINS,) in [0, 1]."""
     x = _bin_x(np.repeat(np.linspace(0.0, 1.0, BINS + 1), 2))
     y = HEIGHT - FOOT - np.pad(np.repeat(share, 2), 1) * (HEIGHT - FOOT - 4)
@@ -286,7 +286,7 @@ def _value_axis(low: float, high: float) -> str:
     return drawn
 
 
-def _bin_x(share: ArrayLike) -> Numbers:
+def _bin_x(share: ArrayLike) -> FloatArray:
     return MARGIN + np.asarray(share) * (WIDTH - 2 * MARGIN)
 
 

@@ -21,10 +21,10 @@ TABLE = 4096  # number of angles in the table that inverts the radius
 STEPS = 8  # Newton steps at most; three from the table's value give an error below 1e-12
 CONVERGED = 1e-10  # error in units of the focal length
 
-Numbers = NDArray[np.float64]
+FloatArray = NDArray[np.float64]
 
 
-def mount_rotation(roll: float, pitch: float, yaw: float) -> Numbers:
+def mount_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Rotation (3, 3) from the car's frame to a camera turned by Rz(yaw) Ry(pitch) Rx(roll)."""
     cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
     ahead = (cy * cp, sy * cp, -sp)
@@ -33,7 +33,7 @@ def mount_rotation(roll: float, pitch: float, yaw: float) -> Numbers:
     return np.array([np.negative(left), np.negative(up), ahead])
 
 
-def project(camera: "CameraParameters", points: Numbers) -> Numbers:
+def project(camera: "CameraParameters", points: FloatArray) -> FloatArray:
     """Pixels (N, 2) of points (N, 3) in the camera's frame; NaN outside the lens model's range."""
     ahead = points[:, 2] > 1e-9
     flat = points[:, :2] / np.where(ahead, points[:, 2], np.nan)[:, None]
@@ -43,11 +43,11 @@ def project(camera: "CameraParameters", points: Numbers) -> Numbers:
         unfolded = jacobian[0, 0] * jacobian[1, 1] > jacobian[0, 1] * jacobian[1, 0]
         flat = np.where(unfolded[:, None], distorted, np.nan)
     k = camera.intrinsics()
-    pixels: Numbers = flat * (k[0, 0], k[1, 1]) + k[:2, 2]
+    pixels: FloatArray = flat * (k[0, 0], k[1, 1]) + k[:2, 2]
     return pixels
 
 
-def rays(camera: "CameraParameters", pixels: ArrayLike) -> Numbers:
+def rays(camera: "CameraParameters", pixels: ArrayLike) -> FloatArray:
     """Directions (N, 3) of pixels (N, 2), with z = 1; NaN where the lens maps no ray to a pixel."""
     k = camera.intrinsics()
     flat = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - k[:2, 2]) / (k[0, 0], k[1, 1])
@@ -56,7 +56,7 @@ def rays(camera: "CameraParameters", pixels: ArrayLike) -> Numbers:
     return np.column_stack([flat, np.ones(len(flat))])
 
 
-def _undistort(camera: "CameraParameters", distorted: Numbers) -> Numbers:
+def _undistort(camera: "CameraParameters", distorted: FloatArray) -> FloatArray:
     """Undistorted points (N, 2) on the plane z = 1; NaN where the distortion has no inverse."""
     kind, coefficients = camera.distortion, camera.coefficients
     angles, radii = _radius_table(kind, coefficients)
@@ -74,11 +74,11 @@ def _undistort(camera: "CameraParameters", distorted: Numbers) -> Numbers:
         found, ((a, b), (c, d)) = _distort(camera, flat)
         good = np.abs(found - distorted).max(1) < CONVERGED * np.maximum(1, radius)
         good &= (a * d > b * c) & (np.arctan(np.hypot(*flat.T)) < angle_limit(kind, coefficients))
-    result: Numbers = np.where(good[:, None], flat, np.nan)
+    result: FloatArray = np.where(good[:, None], flat, np.nan)
     return result
 
 
-def _distort(camera: "CameraParameters", flat: Numbers) -> tuple[Numbers, Numbers]:
+def _distort(camera: "CameraParameters", flat: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distorted points (N, 2) of `flat` (N, 2) on the plane z = 1, and the Jacobian (2, 2, N)."""
     x, y = flat.T
     square = x * x + y * y
@@ -109,7 +109,9 @@ def _distort(camera: "CameraParameters", flat: Numbers) -> tuple[Numbers, Number
     return moved, jacobian
 
 
-def _fisheye_scale(square: Numbers, coefficients: tuple[float, ...]) -> tuple[Numbers, Numbers]:
+def _fisheye_scale(
+    square: FloatArray, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
     """Distorted radius divided by r, and its derivative by r^2, for `square` = r^2 (N,)."""
     r = np.sqrt(square)
     small = r < 1e-4
@@ -159,7 +161,7 @@ def _positive_roots(polynomial: NDArray[np.floating[Any]]) -> list[float]:
 
 
 @lru_cache(maxsize=64)
-def _radius_table(kind: str, coefficients: tuple[float, ...]) -> tuple[Numbers, Numbers]:
+def _radius_table(kind: str, coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     """Angles from the axis (TABLE,) in rad up to `angle_limit`, and their distorted radii."""
     angles = np.linspace(0.0, angle_limit(kind, coefficients), TABLE)
     if kind == "fisheye":

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from controllers.perception.perceived import Perceived
 from controllers.perception.sources import CameraPerception
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, Distances, draw_overlay
-from runtime.film import Film
+from runtime.film import Mp4Writer
 
 if TYPE_CHECKING:
     from simulator.camera import Camera
@@ -41,7 +41,7 @@ class DriveFilm:
 
     def __init__(
         self,
-        film: Film,
+        film: Mp4Writer,
         world: "World",
         camera: "Camera",
         perception: CameraPerception | None = None,

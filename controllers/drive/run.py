@@ -28,7 +28,7 @@ from controllers.perception.real_time import RealTimePerception, real_time
 from controllers.perception.sources import CameraPerception, open_perception
 from controllers.registry import make_controller
 from runtime.files import check_folder
-from runtime.film import FILM_SUFFIX, Film
+from runtime.film import FILM_SUFFIX, Mp4Writer
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -234,7 +234,7 @@ def _observers(
         from controllers.drive.film import DriveFilm
         from simulator.camera import open_camera
 
-        film = stack.enter_context(Film(config.video, FREQUENCY_HZ))
+        film = stack.enter_context(Mp4Writer(config.video, FREQUENCY_HZ))
         seen = perceive if isinstance(perceive, CameraPerception) else None
         if seen is not None:
             camera = seen.camera

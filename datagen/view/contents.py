@@ -27,7 +27,7 @@ from datagen.view.steps import Step, Steps, values
 from runtime.cli import counted
 
 KMH = 3.6
-Numbers = list[float | None]
+Series = list[float | None]
 Points = NDArray[np.float64]
 
 
@@ -40,7 +40,7 @@ class Plot:
 
     title: str
     unit: str
-    series: dict[str, Numbers]
+    series: dict[str, Series]
     dots: bool = False
     limits: tuple[float, float] | None = None
 
@@ -133,9 +133,9 @@ def _plots(steps: list[Step]) -> list[Plot]:
     command = [values(step.command) for step in steps]
     markings = {name: _column(labels, f"to_marking_{name}") for name in tf.MARKINGS}
     offsets = {name: _column(labels, name) for name in ("to_lane_centre", "to_middle")}
-    speed: Numbers = [step.ego.vx * KMH for step in steps]
-    heading: Numbers = [float(step.labels.heading) for step in steps]
-    shadow: Numbers = [step.ego.shadow_fraction for step in steps]
+    speed: Series = [step.ego.vx * KMH for step in steps]
+    heading: Series = [float(step.labels.heading) for step in steps]
+    shadow: Series = [step.ego.shadow_fraction for step in steps]
     pedals = {name: _column(command, name) for name in ("steer", "throttle", "brake")}
     return [
         Plot("Distances to markings", "m", markings, dots=True),
@@ -148,7 +148,7 @@ def _plots(steps: list[Step]) -> list[Plot]:
     ]
 
 
-def _column(rows: Iterable[dict[str, Any]], name: str) -> Numbers:
+def _column(rows: Iterable[dict[str, Any]], name: str) -> Series:
     return [row[name] for row in rows]
 
 

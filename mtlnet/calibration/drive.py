@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtlnet.calibration.film import DriveCalibration, DriveEstimate
-from mtlnet.calibration.lens import Lens
+from mtlnet.calibration.lens import KnownLens
 from mtlnet.calibration.mount import NotCalibrated
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.sources.films import Film, read_film_header
@@ -25,14 +25,14 @@ SHOWN = 6
 """Number of pictures kept for the page."""
 
 Picture = NDArray[np.uint8]
-MakeLens = Callable[[tuple[int, int]], Lens]
+MakeLens = Callable[[tuple[int, int]], KnownLens]
 """Returns the lens of pictures of this size (width, height)."""
 Report = Callable[[float, float], None]
 """Takes the seconds done and the total."""
 
 
 @dataclass(frozen=True)
-class Drive:
+class CalibratedDrive:
     """The estimate, some of the pictures, and a text about the film's fault (empty if it has
     none)."""
 
@@ -47,7 +47,7 @@ def calibrate_film(
     lane_width_m: float | None = None,
     report: Report = lambda done, total: None,
     longest_s: float = LONGEST_S,
-) -> Drive:
+) -> CalibratedDrive:
     """The camera that filmed `path`, from at most its first two minutes. Raises NotCalibrated, or
     UserError for a file that is not a film."""
     header = read_film_header(path)
@@ -70,7 +70,7 @@ def calibrate_film(
     except NotCalibrated as error:
         told = f"; {film.fault}" if film.fault else ""
         raise NotCalibrated(f"{path}: {error}{told}") from error
-    return Drive(found, shown, film.fault)
+    return CalibratedDrive(found, shown, film.fault)
 
 
 def calibrate_pictures(
@@ -78,7 +78,7 @@ def calibrate_pictures(
     make_lens: MakeLens,
     lane_width_m: float | None = None,
     report: Report = lambda done, total: None,
-) -> Drive:
+) -> CalibratedDrive:
     """The camera that took these pictures of a drive, in this order. Raises NotCalibrated."""
 
     def timed() -> Iterator[tuple[float, Picture]]:
@@ -86,7 +86,7 @@ def calibrate_pictures(
             report(float(number), float(len(paths)))
             yield PICTURE_S * number, read_whole_image(path)
 
-    return Drive(*_calibrate(timed(), make_lens, lane_width_m, len(paths) / SHOWN))
+    return CalibratedDrive(*_calibrate(timed(), make_lens, lane_width_m, len(paths) / SHOWN))
 
 
 def _calibrate(

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.calibration.lens import Lens
+from mtlnet.calibration.lens import KnownLens
 from mtlnet.calibration.markings import Segments, find_segments
 from mtlnet.calibration.motion import find_motion, follow
 from mtlnet.calibration.mount import Mount, NotCalibrated, Sample, TimedMotion, find_mount
@@ -54,7 +54,7 @@ class DriveEstimate:
     yaw_std_deg: float
     roll_std_deg: float
     height_std_m: float
-    lens: Lens
+    lens: KnownLens
     lane_width_m: float
     lane_width_given: bool
     pictures: int
@@ -101,7 +101,7 @@ class DriveCalibration:
     lane width, `LANE_WIDTH_M` is assumed.
     """
 
-    def __init__(self, lens: Lens, lane_width_m: float | None = None) -> None:
+    def __init__(self, lens: KnownLens, lane_width_m: float | None = None) -> None:
         check_lane_width(lane_width_m)
         self._lens = lens
         camera = lens.camera

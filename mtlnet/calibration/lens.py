@@ -23,7 +23,7 @@ HEAD_BYTES = 1 << 17
 
 
 @dataclass(frozen=True)
-class Lens:
+class KnownLens:
     """A camera's size and lens. `std`: relative standard deviation of the focal length; `about`: a
     text about the source of these values."""
 
@@ -38,7 +38,7 @@ def find_lens(
     given: CameraParameters | None = None,
     fov_y_deg: float | None = None,
     photo: Path | None = None,
-) -> Lens:
+) -> KnownLens:
     """The lens of pictures of `size` (width, height).
 
     The first known of: the lens `given`, the field of view `fov_y_deg`, the focal length of
@@ -52,22 +52,24 @@ def find_lens(
                 f"the pictures are {width} x {height} px, those of the camera file "
                 f"{given.width} x {given.height}: give the file of this camera"
             )
-        return Lens(given.resized(width, height), 0.0, "its lens is given")
+        return KnownLens(given.resized(width, height), 0.0, "its lens is given")
     plain = CameraParameters(width, height, x=model.x, y=model.y)
     if fov_y_deg is not None:
         try:
             found = replace(plain, fov_y_deg=fov_y_deg)
         except CameraError as error:
             raise UserError(f"--fov-y-deg: {error}") from error
-        return Lens(found, 0.0, f"field of view {fov_y_deg:g} deg, given")
+        return KnownLens(found, 0.0, f"field of view {fov_y_deg:g} deg, given")
     if photo is not None:
         focal_px = photo_focal_share(photo) * max(size)
         fov = degrees(2 * atan(height / 2 / focal_px))
-        return Lens(replace(plain, fov_y_deg=fov), PHOTO_STD, f"field of view {fov:.1f} deg, EXIF")
+        return KnownLens(
+            replace(plain, fov_y_deg=fov), PHOTO_STD, f"field of view {fov:.1f} deg, EXIF"
+        )
     focal_px = max(size) / 2 / tan(radians(GUESSED_FOV_DEG) / 2)
     fov = degrees(2 * atan(height / 2 / focal_px))
     about = f"field of view {fov:.1f} deg, guessed: give --fov-y-deg"
-    return Lens(replace(plain, fov_y_deg=fov), GUESSED_STD, about)
+    return KnownLens(replace(plain, fov_y_deg=fov), GUESSED_STD, about)
 
 
 def photo_focal_share(path: Path) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtlnet.calibration.board import BoardCalibration, BoardPicture
-from mtlnet.calibration.drive import Drive
+from mtlnet.calibration.drive import CalibratedDrive
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from runtime.files import atomic_write
 from runtime.html import embed_jpeg, render
@@ -74,7 +74,7 @@ def draw_corners(picture: BoardPicture) -> Picture:
     return image
 
 
-def write_drive_page(path: Path, drive: Drive, name: str) -> None:
+def write_drive_page(path: Path, drive: CalibratedDrive, name: str) -> None:
     """Write the page of a drive: pictures with the horizon and the markings of a straight lane."""
     found = drive.found
     std = [found.pitch_std_deg, found.yaw_std_deg, found.roll_std_deg, found.height_std_m]

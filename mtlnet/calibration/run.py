@@ -7,11 +7,11 @@ from typing import Any
 
 from mtlnet.calibration.board import calibrate_board
 from mtlnet.calibration.config import CalibrateConfig
-from mtlnet.calibration.drive import Drive, Report, calibrate_film, calibrate_pictures
+from mtlnet.calibration.drive import CalibratedDrive, Report, calibrate_film, calibrate_pictures
 from mtlnet.calibration.film import check_lane_width
-from mtlnet.calibration.lens import Lens, find_lens
+from mtlnet.calibration.lens import KnownLens, find_lens
 from mtlnet.sources.find import find_sources
-from mtlnet.sources.kinds import Kind, kind_of
+from mtlnet.sources.kinds import SourceKind, kind_of
 from runtime.camera_file import read_camera, write_camera
 from runtime.files import check_folder
 from trackfeatures.camera import CameraParameters
@@ -31,7 +31,7 @@ def calibrate(
         check_folder(config.page)
     check_lane_width(config.lane_width_m)
     paths = _files(config.inputs)
-    films = [path for path in paths if kind_of(path) is Kind.FILM]
+    films = [path for path in paths if kind_of(path) is SourceKind.FILM]
     if films or config.drive:
         return _calibrate_drive(config, paths, films, report)
     return _calibrate_board(config, paths)
@@ -42,7 +42,7 @@ def _files(inputs: Sequence[str]) -> list[Path]:
     for source in sources:
         if source.problem:
             raise UserError(source.problem)
-        if source.kind not in (Kind.IMAGE, Kind.FILM):
+        if source.kind not in (SourceKind.IMAGE, SourceKind.FILM):
             raise UserError(
                 f"{source.name} is a {source.kind.value}; give a film of a drive, or pictures"
             )
@@ -86,7 +86,7 @@ def _calibrate_drive(
     model = CameraParameters()
     given = None if config.camera is None else read_camera(config.camera, model)
 
-    def make_lens(size: tuple[int, int]) -> Lens:
+    def make_lens(size: tuple[int, int]) -> KnownLens:
         photo = config.photo or (None if films else _with_exif(paths[0]))
         return find_lens(size, model, given, config.fov_y_deg, photo)
 
@@ -108,7 +108,7 @@ def _with_exif(path: Path) -> Path | None:
     return path
 
 
-def _write_drive(config: CalibrateConfig, drive: Drive) -> tuple[dict[str, Any], str]:
+def _write_drive(config: CalibrateConfig, drive: CalibratedDrive) -> tuple[dict[str, Any], str]:
     line = drive.found.about()
     write_camera(config.out, drive.found.camera, f"mtlnet calibrate: {line}")
     if config.page is not None:

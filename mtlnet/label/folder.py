@@ -23,7 +23,7 @@ from mtlnet.data.labels_file import (
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import CAMERA_FILE, TOLERANCE, read_camera
 from mtlnet.label.geometry import Markings
-from mtlnet.sources.kinds import Kind, kind_of
+from mtlnet.sources.kinds import SourceKind, kind_of
 from runtime.camera_file import write_camera
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
@@ -77,7 +77,7 @@ class LabelFolder:
             if any(part.startswith(".") for part in path.relative_to(self.folder).parts):
                 continue
             within = path.resolve().is_relative_to(self.folder)
-            if within and path.is_file() and kind_of(path) is Kind.IMAGE:
+            if within and path.is_file() and kind_of(path) is SourceKind.IMAGE:
                 found.append(name)
         return sorted(found, key=natural_key)
 

@@ -161,7 +161,7 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
 
 
 @dataclass(frozen=True)
-class Answers:
+class NetworkOutputs:
     """The results of a network for B images."""
 
     uncertainty_inputs: NDArray[np.float32]
@@ -172,16 +172,16 @@ class Answers:
     """Probabilities (B, 5) that each marking is absent; (B, 0) for heads of coded values."""
 
 
-def run_network(network: Network, images: NDArray[np.uint8]) -> Answers:
+def run_network(network: Network, images: NDArray[np.uint8]) -> NetworkOutputs:
     """Results for images (B, 210, 280, 3), computed in batches of `RUN_BATCH`."""
     network.eval()
     starts = range(0, max(len(images), 1), RUN_BATCH)
     parts = [_run_batch(network, torch.from_numpy(images[i : i + RUN_BATCH])) for i in starts]
-    return Answers(*(torch.cat(each).cpu().numpy() for each in zip(*parts, strict=True)))
+    return NetworkOutputs(*(torch.cat(each).cpu().numpy() for each in zip(*parts, strict=True)))
 
 
 def _run_batch(network: Network, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The fields of `Answers` for one batch."""
+    """The fields of `NetworkOutputs` for one batch."""
     with torch.inference_mode():
         x = network.forward_features(images.to(next(network.parameters()).device)).float()
         outputs = network.forward_heads(x)

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from mtlnet.calibration.drive import calibrate_film
 from mtlnet.calibration.film import DriveCalibration, DriveEstimate
-from mtlnet.calibration.lens import Lens as KnownLens
-from mtlnet.calibration.lens import find_lens
+from mtlnet.calibration.lens import KnownLens, find_lens
 from mtlnet.calibration.mount import NotCalibrated
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.rectification import Rectification
 from mtlnet.sources.find import Note, Source
-from mtlnet.sources.kinds import Kind
+from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens, Picture
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -43,15 +42,15 @@ def with_lens(
     If a field of view is given, `calibrate` estimates the mount. `note`: called with a line about
     what was found.
     """
-    if isinstance(given, Rectification) or source.problem or source.kind is Kind.ROUND:
+    if isinstance(given, Rectification) or source.problem or source.kind is SourceKind.ROUND:
         return replace(source, lens=given)
-    if given is None and source.kind is Kind.RECORDING and source.opened is not None:
+    if given is None and source.kind is SourceKind.RECORDING and source.opened is not None:
         stated = _stated(source, model, note)
         if stated is not None:
             return stated
-    if calibrate and source.kind is Kind.FILM:
+    if calibrate and source.kind is SourceKind.FILM:
         return replace(source, lens=_of_film(source, model, given, note))
-    if calibrate and source.kind is Kind.STREAM:
+    if calibrate and source.kind is SourceKind.STREAM:
         return replace(source, lens=DriveLens(source.name, model, given, note))
     return replace(source, lens=given)
 

@@ -17,7 +17,7 @@ from mtlnet.inference.prediction import Prediction, decode_outputs
 from mtlnet.predict.lenses import with_lens
 from mtlnet.predict.writers import Writer, open_writer, require_other_file
 from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
-from mtlnet.sources.kinds import Kind
+from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
 from mtlnet.sources.read import READ_AHEAD, SourceImage, read_sources
 from mtlnet.sources.streams import Stream
@@ -84,7 +84,7 @@ def predict_files(
             for item in items:
                 answers.add(item, writing)
         except KeyboardInterrupt:
-            if not any(source.kind is Kind.STREAM for source in usable):
+            if not any(source.kind is SourceKind.STREAM for source in usable):
                 raise
             note(f"stopped after {answers.used} images")
     for source in sources:

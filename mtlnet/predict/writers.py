@@ -20,7 +20,7 @@ import trackfeatures as tf
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction
 from mtlnet.sources.read import SourceImage
-from runtime.film import FILM_SUFFIX, Film
+from runtime.film import FILM_SUFFIX, Mp4Writer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -126,7 +126,7 @@ class FilmWriter:
     interrupted."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
-        self._camera, self._film = camera, Film(path, fps)
+        self._camera, self._film = camera, Mp4Writer(path, fps)
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         self._film.write(draw_prediction(item, prediction, self._camera))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mtlnet.sources.films import read_film_header
-from mtlnet.sources.kinds import Kind, bag_metadata, kind_of
+from mtlnet.sources.kinds import SourceKind, bag_metadata, kind_of
 from mtlnet.sources.pictures import Lens, LensFinder
 from mtlnet.sources.streams import Stream, is_live, open_stream, shown_name
 from runtime.files import natural_key
@@ -30,7 +30,7 @@ class Source:
     """One file, webcam or stream."""
 
     path: Path
-    kind: Kind = Kind.IMAGE
+    kind: SourceKind = SourceKind.IMAGE
     count: int = 1
     """Number of images; for a film as declared in its header; 0: unknown."""
     fps: float = DEFAULT_FPS
@@ -74,11 +74,11 @@ def _find(given: str, note: Note, topic: str) -> list[Source]:
     try:
         if path.is_dir():
             if bag_metadata(path) is not None:
-                return [_source(path, Kind.RECORDING, topic)]
+                return [_source(path, SourceKind.RECORDING, topic)]
             return _in_folder(path, note, topic)
         if path.is_file():
             return [
-                _source(path, kind_of(path) or Kind.IMAGE, topic)
+                _source(path, kind_of(path) or SourceKind.IMAGE, topic)
             ]  # the error then describes the content
         if os.path.lexists(path):
             reason = "its target is missing" if path.is_symlink() else "a pipe or a device"
@@ -138,21 +138,23 @@ def _stream(given: str) -> Source:
     try:
         opened = open_stream(given)
     except UserError as error:
-        return Source(path, Kind.STREAM, 0, problem=str(error), address=name)
-    return Source(path, Kind.STREAM, 0, opened.fps or DEFAULT_FPS, address=name, opened=opened)
+        return Source(path, SourceKind.STREAM, 0, problem=str(error), address=name)
+    return Source(
+        path, SourceKind.STREAM, 0, opened.fps or DEFAULT_FPS, address=name, opened=opened
+    )
 
 
-def _source(path: Path, kind: Kind, topic: str) -> Source:
+def _source(path: Path, kind: SourceKind, topic: str) -> Source:
     try:
-        if kind is Kind.RECORDING:
+        if kind is SourceKind.RECORDING:
             from mtlnet.sources.recordings.recording import open_recording
 
             found = open_recording(path, topic)
             return Source(path, kind, found.count, opened=found)
-        if kind is Kind.FILM:
+        if kind is SourceKind.FILM:
             header = read_film_header(path)
             return Source(path, kind, header.count, header.fps or DEFAULT_FPS)
-        if kind is Kind.ROUND:
+        if kind is SourceKind.ROUND:
             from datagen.recording import open_round
 
             index = open_round(path)

@@ -13,7 +13,7 @@ import yaml
 from mtlnet.inference.image_decoding.other_kinds import SUFFIXES
 
 
-class Kind(Enum):
+class SourceKind(Enum):
     """Kind of a source of images."""
 
     IMAGE = "image"
@@ -56,7 +56,7 @@ MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide")
 TS_SYNC, TS_PACKETS = 0x47, ((0, 188), (4, 192))  # MPEG-TS, and with the times of Blu-ray
 
 
-def kind_of(path: Path) -> Kind | None:
+def kind_of(path: Path) -> SourceKind | None:
     """Kind of the file at `path`; None for a kind that is not read."""
     suffix = path.suffix.lower()
     try:
@@ -66,15 +66,15 @@ def kind_of(path: Path) -> Kind | None:
         head = b""
     if suffix == ROUND or head.startswith(MCAP_START):
         is_round = not head.startswith(MCAP_START) or ROUND_NAME in head + _tail(path)
-        return Kind.ROUND if is_round else Kind.RECORDING
+        return SourceKind.ROUND if is_round else SourceKind.RECORDING
     if head.startswith(SQLITE_START):
-        return Kind.RECORDING
+        return SourceKind.RECORDING
     found = _kind_of_content(head)
-    if found is Kind.IMAGE and suffix in MJPEG:
-        return Kind.FILM
+    if found is SourceKind.IMAGE and suffix in MJPEG:
+        return SourceKind.FILM
     if found is None and suffix in IMAGES:
-        return Kind.IMAGE
-    return Kind.FILM if found is None and suffix in FILMS else found
+        return SourceKind.IMAGE
+    return SourceKind.FILM if found is None and suffix in FILMS else found
 
 
 def _tail(path: Path) -> bytes:
@@ -83,15 +83,15 @@ def _tail(path: Path) -> bytes:
         return file.read()
 
 
-def _kind_of_content(head: bytes) -> Kind | None:
+def _kind_of_content(head: bytes) -> SourceKind | None:
     if head[:4] == b"RIFF":
-        return {b"WEBP": Kind.IMAGE, b"AVI ": Kind.FILM}.get(head[8:12])
+        return {b"WEBP": SourceKind.IMAGE, b"AVI ": SourceKind.FILM}.get(head[8:12])
     if head[4:8] in MP4_BOXES:
-        return Kind.IMAGE if head[8:12] in IMAGE_BRANDS else Kind.FILM
+        return SourceKind.IMAGE if head[8:12] in IMAGE_BRANDS else SourceKind.FILM
     if head.startswith(IMAGE_STARTS):
-        return Kind.IMAGE
+        return SourceKind.IMAGE
     is_ts = any(head[first : first + 2 * step : step] == b"GG" for first, step in TS_PACKETS)
-    return Kind.FILM if is_ts or head.startswith(FILM_STARTS) else None
+    return SourceKind.FILM if is_ts or head.startswith(FILM_STARTS) else None
 
 
 def bag_metadata(folder: Path) -> dict[str, Any] | None:

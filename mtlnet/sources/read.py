@@ -14,7 +14,7 @@ from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import Rectification
 from mtlnet.sources.films import Film
 from mtlnet.sources.find import Source, unreadable
-from mtlnet.sources.kinds import Kind
+from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Image, Lens, LensFinder, Picture, Pictures, fit
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -82,7 +82,9 @@ def read_sources(
 def _read(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
     """The images of a source. An error becomes an item and ends only this source."""
     name = source.name
-    read = {Kind.ROUND: _read_round, Kind.IMAGE: _read_file}.get(source.kind, _read_pictures)
+    read = {SourceKind.ROUND: _read_round, SourceKind.IMAGE: _read_file}.get(
+        source.kind, _read_pictures
+    )
     try:
         if source.problem:
             raise UserError(source.problem)

@@ -18,7 +18,7 @@ from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
 from runtime.camera_file import write_camera
-from runtime.film import Film
+from runtime.film import Mp4Writer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -64,7 +64,7 @@ def test_a_film_is_answered_frame_by_frame_as_by_the_command(
     model: Model, road: np.ndarray, tmp_path: Path
 ) -> None:
     film = tmp_path / "drive.mp4"
-    with Film(film, 20.0) as writer:
+    with Mp4Writer(film, 20.0) as writer:
         for number in range(5):
             writer.write(np.roll(road, 3 * number, axis=1))
     answers = model.predict(film)

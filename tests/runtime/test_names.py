@@ -11,7 +11,7 @@ import pytest
 
 from runtime.cli import printable
 from runtime.files import atomic_write, natural_key
-from runtime.film import Film
+from runtime.film import Mp4Writer
 from trackfeatures.errors import UserError
 
 
@@ -88,7 +88,7 @@ def test_a_text_file_takes_any_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [b"caf\xe9.mp4", b"a:b.mp4", b"%03d.mp4", b"-i\n#?.mp4"])
 def test_a_film_of_any_name_is_written(tmp_path: Path, name: bytes) -> None:
     path = tmp_path / os.fsdecode(name)
-    with Film(path, 10.0) as film:
+    with Mp4Writer(path, 10.0) as film:
         for _ in range(3):
             film.write(np.zeros((64, 64, 3), np.uint8))
     plain = path.rename(tmp_path / "plain.mp4")
@@ -97,7 +97,7 @@ def test_a_film_of_any_name_is_written(tmp_path: Path, name: bytes) -> None:
 
 def test_a_film_that_a_full_disk_cut_is_told(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
-    film = Film(path, 10.0)
+    film = Mp4Writer(path, 10.0)
     film.write(np.zeros((64, 64, 3), np.uint8))
     path.unlink()
     path.write_bytes(b"what the disk took")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Chunks, Surface
 from simulator.camera.scene.light import Light
-from simulator.camera.scene.terrain import CentreLine, Terrain, between
+from simulator.camera.scene.terrain import CentreLineSamples, Terrain, between
 from simulator.camera.vegetation.scenery import Trees
 
 LAYOUT = ("3f 3f 1f", "at", "facing", "sunlit")
@@ -32,7 +32,9 @@ class TreeShade:
     shade: FloatArray
 
     @classmethod
-    def of(cls, terrain: Terrain, line: CentreLine, trees: Trees, light: Light) -> "TreeShade":
+    def of(
+        cls, terrain: Terrain, line: CentreLineSamples, trees: Trees, light: Light
+    ) -> "TreeShade":
         """The shade of `trees` under the sun of `light`, zero where it casts no hard shadow."""
         shade: FloatArray = np.zeros(terrain.z.shape)
         if light.shade >= 0.5:

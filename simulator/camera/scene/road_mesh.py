@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Surface
 from simulator.camera.scene.strips import LEVELS, Level, strip
-from simulator.camera.scene.terrain import CentreLine, Survey, Terrain
+from simulator.camera.scene.terrain import CentreLineSamples, Survey, Terrain
 from simulator.track.road import Road
 
 LAYOUT = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
@@ -76,7 +76,7 @@ def rows_of(road: Road) -> FloatArray:
     return np.append(start + size * number, track.length_m)
 
 
-def build(road: Road, line: CentreLine, terrain: Terrain) -> RoadMesh:
+def build(road: Road, line: CentreLineSamples, terrain: Terrain) -> RoadMesh:
     """Build the mesh, with skirts that end below the terrain."""
     s = rows_of(road)
     pose = road.track.at(s)
@@ -100,7 +100,7 @@ def build(road: Road, line: CentreLine, terrain: Terrain) -> RoadMesh:
 
 
 def _skirt(
-    road: Road, line: CentreLine, s: FloatArray, curvature: FloatArray, side: float
+    road: Road, line: CentreLineSamples, s: FloatArray, curvature: FloatArray, side: float
 ) -> FloatArray:
     """Width of the skirt on one side (+1 left), limited so that it overlaps no part of the road."""
     width = np.full(len(s), 0.4)
@@ -181,12 +181,12 @@ class Ground:
     """What a scene stands on: the road with its centre line and mesh, and the terrain."""
 
     road: Road
-    line: CentreLine
+    line: CentreLineSamples
     mesh: RoadMesh
     terrain: Terrain
 
     @classmethod
-    def of(cls, road: Road, line: CentreLine, terrain: Terrain) -> Self:
+    def of(cls, road: Road, line: CentreLineSamples, terrain: Terrain) -> Self:
         """The ground of `road`, its mesh built."""
         return cls(road, line, build(road, line, terrain), terrain)
 

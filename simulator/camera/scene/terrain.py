@@ -35,7 +35,7 @@ BANK_SLOPE = 0.55
 
 
 @dataclass(frozen=True)
-class CentreLine:
+class CentreLineSamples:
     """Samples of a road's centre line, every `SAMPLE_M`, with a tree to search them."""
 
     s: FloatArray
@@ -45,7 +45,7 @@ class CentreLine:
     tree: "cKDTree"
 
     @classmethod
-    def of(cls, road: Road) -> "CentreLine":
+    def of(cls, road: Road) -> "CentreLineSamples":
         """Sample `road`."""
         length = road.track.length_m
         s = np.arange(0.0, length, length / max(8, round(length / SAMPLE_M)))
@@ -97,7 +97,7 @@ class Survey:
     line.
     """
 
-    line: CentreLine
+    line: CentreLineSamples
     grid: Grid
     cap: FloatArray
     base: FloatArray
@@ -107,7 +107,7 @@ class Survey:
     @classmethod
     def of(cls, road: Road) -> "Survey":
         """The survey of `road`."""
-        line = CentreLine.of(road)
+        line = CentreLineSamples.of(road)
         span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
         cell = max(CELL_M, span / MAX_CELLS)
         x0, y0 = line.x.min() - MARGIN_M, line.y.min() - MARGIN_M
@@ -168,7 +168,7 @@ def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) ->
     return Terrain(grid, np.maximum(np.minimum(natural, survey.cap), sea), sea)
 
 
-def _road_cap(road: Road, line: CentreLine, grid: Grid) -> FloatArray:
+def _road_cap(road: Road, line: CentreLineSamples, grid: Grid) -> FloatArray:
     """The greatest height of each grid point at which it covers no part of the road."""
     reach = road.wall_offset + 5.0 + 50.0
     offsets = np.arange(-reach, reach + 0.5 * grid.cell, 0.6 * grid.cell)
@@ -186,7 +186,7 @@ def _road_cap(road: Road, line: CentreLine, grid: Grid) -> FloatArray:
 
 
 def _spread(
-    road: Road, line: CentreLine, grid: Grid
+    road: Road, line: CentreLineSamples, grid: Grid
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Smoothed road heights on the grid; each point's distance to the road and the nearest
     sample of its centre line."""
@@ -203,7 +203,7 @@ def _spread(
     return narrow + (wide - narrow) * far, near, index.reshape(grid.shape)
 
 
-def _outside(line: CentreLine, grid: Grid) -> FloatArray:
+def _outside(line: CentreLineSamples, grid: Grid) -> FloatArray:
     """1 outside the loop of the road, 0 inside, with a smooth transition."""
     loop = np.stack([(line.x - grid.x0) / grid.cell, (line.y - grid.y0) / grid.cell], axis=1)
     inside = np.zeros(grid.shape, dtype=np.float32)

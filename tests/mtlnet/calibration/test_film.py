@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mtlnet.calibration.film import DriveCalibration, DriveEstimate
-from mtlnet.calibration.lens import Lens
+from mtlnet.calibration.lens import KnownLens
 from mtlnet.calibration.mount import NotCalibrated
 from tests.mtlnet.calibration.drawn import road_picture
 from trackfeatures.camera import CameraParameters
@@ -26,7 +26,7 @@ def calibrated(
     camera: CameraParameters, pictures: int = 40, lane_m: float | None = LANE_M
 ) -> DriveEstimate:
     """The estimate from a car that sways 0.4 m to both sides of the middle of its lane."""
-    calibration = DriveCalibration(Lens(LENS, 0.0, "given"), lane_m)
+    calibration = DriveCalibration(KnownLens(LENS, 0.0, "given"), lane_m)
     for number in range(pictures):
         time_s = 0.2 * number
         left = 0.4 * math.sin(time_s)
@@ -62,8 +62,8 @@ def test_an_assumed_lane_width_is_uncertain() -> None:
 
 
 def test_the_field_of_view_does_not_change_the_height() -> None:
-    wrong = Lens(replace(LENS, fov_y_deg=45.0), 0.2, "guessed")
-    right = DriveCalibration(Lens(LENS, 0.0, "given"), LANE_M)
+    wrong = KnownLens(replace(LENS, fov_y_deg=45.0), 0.2, "guessed")
+    right = DriveCalibration(KnownLens(LENS, 0.0, "given"), LANE_M)
     other = DriveCalibration(wrong, LANE_M)
     for number in range(20):
         picture = road_picture(replace(LENS, pitch_deg=2.0), [-1.75, 1.75])
@@ -83,7 +83,8 @@ def test_the_field_of_view_does_not_change_the_height() -> None:
 def test_a_distorted_lens_gives_the_same_mount() -> None:
     bent = replace(MOUNTS[0], distortion="opencv", coefficients=(-0.2, 0.03, 0.0, 0.0))
     calibration = DriveCalibration(
-        Lens(replace(LENS, distortion="opencv", coefficients=bent.coefficients), 0.0, ""), LANE_M
+        KnownLens(replace(LENS, distortion="opencv", coefficients=bent.coefficients), 0.0, ""),
+        LANE_M,
     )
     for number in range(20):
         calibration.add(road_picture(bent, [-5.25, -1.75, 1.75]), 0.2 * number)
@@ -96,7 +97,7 @@ def test_a_distorted_lens_gives_the_same_mount() -> None:
 def test_few_pictures_and_pictures_without_markings_are_refused() -> None:
     with pytest.raises(NotCalibrated, match=r"5 of 5 pictures show both markings.* at least 12"):
         calibrated(MOUNTS[0], pictures=5)
-    calibration = DriveCalibration(Lens(LENS, 0.0, ""))
+    calibration = DriveCalibration(KnownLens(LENS, 0.0, ""))
     with pytest.raises(NotCalibrated, match="no markings of a road can be seen in 0 pictures"):
         calibration.estimate()
     rng = np.random.default_rng(0)
@@ -108,7 +109,7 @@ def test_few_pictures_and_pictures_without_markings_are_refused() -> None:
 
 
 def test_pictures_in_between_are_passed_over() -> None:
-    calibration = DriveCalibration(Lens(LENS, 0.0, ""))
+    calibration = DriveCalibration(KnownLens(LENS, 0.0, ""))
     picture = road_picture(LENS, [-1.75, 1.75])
     for number in range(61):
         calibration.add(picture, number / 30)

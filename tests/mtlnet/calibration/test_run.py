@@ -14,10 +14,10 @@ from mtlnet.calibration.run import calibrate
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.lenses import DriveLens, with_lens
 from mtlnet.sources.find import Source
-from mtlnet.sources.kinds import Kind
+from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Picture
 from runtime.camera_file import read_camera
-from runtime.film import Film
+from runtime.film import Mp4Writer
 from tests.mtlnet.calibration.drawn import board_pictures, chessboard, road_picture
 from tests.mtlnet.conftest import write_dataset
 from tests.typed import error_line, typed
@@ -33,7 +33,7 @@ MARKINGS_M = [-1.6, 1.7]
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six seconds of a straight road."""
     path = tmp_path_factory.mktemp("films") / "drive.mp4"
-    with Film(path, 5.0) as made:
+    with Mp4Writer(path, 5.0) as made:
         for number in range(30):
             made.write(road_picture(CAMERA, [left + 0.02 * (-1) ** number for left in MARKINGS_M]))
     return path
@@ -80,7 +80,7 @@ def test_a_board_becomes_a_camera_file(tmp_path: Path) -> None:
 
 def _no_markings(path: Path) -> Path:
     rng = np.random.default_rng(0)
-    with Film(path, 5.0) as made:
+    with Mp4Writer(path, 5.0) as made:
         for _ in range(20):
             made.write(rng.normal(110, 5, (240, 320, 3)).clip(0, 255).astype(np.uint8))
     return path
@@ -126,7 +126,7 @@ def test_a_film_that_breaks_off_is_told_and_used(
 
 def test_predict_finds_the_camera_of_a_film(film: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    source = Source(film, Kind.FILM)
+    source = Source(film, SourceKind.FILM)
     lens = with_lens(source, MODEL, 60.0, lines.append, calibrate=True).lens
     assert isinstance(lens, Rectification)
     assert lens.source.pitch_deg == pytest.approx(2.0, abs=0.15)
@@ -134,7 +134,7 @@ def test_predict_finds_the_camera_of_a_film(film: Path, tmp_path: Path) -> None:
     assert len(lines) == 1
     assert lines[0].startswith(f"{film}: camera found: pitch ")
     assert with_lens(source, MODEL, 60.0, lines.append).lens == 60.0  # --camera model
-    none = Source(_no_markings(tmp_path / "none.mp4"), Kind.FILM)
+    none = Source(_no_markings(tmp_path / "none.mp4"), SourceKind.FILM)
     assert with_lens(none, MODEL, None, lines.append, calibrate=True).lens is None
     assert "no camera found (" in lines[1]
     assert "the model's own is assumed" in lines[1]
@@ -158,9 +158,9 @@ def test_the_command_finds_it_unless_the_camera_is_the_models(film: Path) -> Non
 
 def test_a_film_of_the_models_size_is_not_calibrated(tmp_path: Path) -> None:
     path, lines = tmp_path / "own.mp4", list[str]()
-    with Film(path, 5.0) as made:
+    with Mp4Writer(path, 5.0) as made:
         made.write(road_picture(MODEL, MARKINGS_M))
-    source = with_lens(Source(path, Kind.FILM), MODEL, None, lines.append, calibrate=True)
+    source = with_lens(Source(path, SourceKind.FILM), MODEL, None, lines.append, calibrate=True)
     assert (source.lens, lines) == (None, [])
 
 

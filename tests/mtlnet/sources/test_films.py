@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mtlnet.sources.films import Film, read_film_header
-from mtlnet.sources.kinds import Kind, kind_of
+from mtlnet.sources.kinds import SourceKind, kind_of
 from trackfeatures.errors import UserError
 
 FRAMES = 20
@@ -77,7 +77,7 @@ def test_every_frame_of_a_sound_film_is_read_whatever_its_name(
     assert read(film)[:2] == (list(range(FRAMES)), "")
     other = film.rename(os.fsdecode(bytes(film.parent) + b"/caf\xe9:%d #?*[\n.jpg"))
     if not name.endswith(".mjpeg"):  # it begins as an image does
-        assert kind_of(other) is Kind.FILM
+        assert kind_of(other) is SourceKind.FILM
     assert read_film_header(other).fps in (10, 25)  # raw streams state no rate: FFmpeg takes 25
     assert len(read(other)[0]) == FRAMES
 
@@ -215,7 +215,7 @@ def test_what_cannot_be_shown_as_the_header_says_is_refused(
 )
 def test_rare_containers_are_known_by_name(make: Make, arguments: list[str], name: str) -> None:
     film = make(*PICTURES, *arguments, name)
-    assert kind_of(film) is Kind.FILM
+    assert kind_of(film) is SourceKind.FILM
     assert len(read(film)[0]) >= FRAMES
 
 
@@ -236,7 +236,7 @@ def test_a_picture_cut_by_the_container_is_refused(make: Make) -> None:
     """A Matroska header with PixelCropTop; FFmpeg writes none, so a Void element becomes one."""
     film = make(*PICTURES, "-vf", "crop=280:210", *H264, "-metadata", "a=b", "a.mkv")
     content = film.read_bytes()
-    assert kind_of(film) is Kind.FILM
+    assert kind_of(film) is SourceKind.FILM
     video = content.index(b"\xb0\x82\x01\x18\xba\x81\xd2")  # PixelWidth 280, PixelHeight 210
     # The element after the height is overwritten by PixelCropTop = 9.
     rest = content[video + 7 : video + 11]

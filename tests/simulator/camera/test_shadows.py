@@ -10,7 +10,7 @@ from simulator.camera.bridges.bridges import CLEARANCE_M, Bridge
 from simulator.camera.scene import shadow_mask
 from simulator.camera.scene.road_mesh import Ground
 from simulator.camera.scene.shadow_mask import cast_bridges
-from simulator.camera.scene.terrain import CentreLine, Survey
+from simulator.camera.scene.terrain import CentreLineSamples, Survey
 from simulator.camera.scene.terrain import build as build_terrain
 from simulator.camera.scene.themes import find_theme, themes
 from simulator.camera.snapshot import standing_pose
@@ -124,7 +124,7 @@ def test_bridges_leave_the_specified_clearance_over_the_road(name: str) -> None:
     """No part of a bridge is lower than 2.4 m between the wall lines, or lower than 3 m over the
     asphalt; the middle of a bridge has the clearance of CLEARANCE_M."""
     road = Road(find_track(name), 1 + len(name) % 3)
-    line = CentreLine.of(road)
+    line = CentreLineSamples.of(road)
     found = bridges_of(road, seed=2)
     assert len(found) >= 2
     for bridge in found:
