@@ -4,10 +4,10 @@
 
 `deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), with which the paper compares:
 AlexNet with a fourth fully connected layer, trained on one task, the regression of coded values.
-Layers, padding and local response normalisation are those of the authors' Caffe model. Deviations:
-the outputs are our six coded values instead of their fourteen, and linear, without a sigmoid; no
-mean image is subtracted; training uses our recipes. It has no classifier: each class has
-probability one third.
+Layers, padding and local response normalisation are taken from the authors' Caffe model.
+Deviations: the outputs are our six coded values instead of their fourteen, and linear, without a
+sigmoid; no mean image is subtracted; training uses our recipes. It has no classifier: each class
+has probability one third.
 
 `grid`: five convolutions that keep a grid of 9 x 18 places; the paper's convolutions end in a
 single place. Its outputs are distributions over bins (`mtlnet.model.bins`). It does not read the
@@ -83,7 +83,7 @@ class Architecture:
 
     @property
     def default_alpha(self) -> tuple[float, float, float]:
-        """Task weights: those of the paper's MTL 3, or equal weights for a network without a
+        """Default task weights: the weights of the paper's MTL 3, or equal weights without a
         classifier."""
         return (0.3, 0.2, 0.5) if "heading" in self.tasks else (1.0, 1.0, 0.0)
 

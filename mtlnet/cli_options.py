@@ -1,4 +1,4 @@
-"""Options of the `mtlnet` commands, those of the first commands first.
+"""Options of the `mtlnet` commands, in the order of the commands.
 
 The options of `train`, `ablate` and `calibrate` are fields of their configurations.
 """

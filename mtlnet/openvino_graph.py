@@ -31,7 +31,7 @@ UNCERTAINTY_TOLERANCE = 5e-3
 def build_graph(network: Network, head: UncertaintyHead | None = None, batch: int = 1) -> Any:
     """OpenVINO model of a folded network: uint8 images (B, 210, 280, 3) -> float32 (B, 9 to 22).
 
-    The columns are those of `mtlnet.inference.prediction.split_outputs`. `batch`: number of images;
+    `mtlnet.inference.prediction.split_outputs` describes the columns. `batch`: number of images;
     -1: any number, which is slower for a single image.
     """
     return model_of(_nodes(network, batch), head)

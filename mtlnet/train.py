@@ -116,7 +116,7 @@ def train(
     *,
     checked: bool = False,
 ) -> ModelCard:
-    """Train by `config` and publish the model in `config.out`; the arguments are those of
+    """Train by `config` and publish the model in `config.out`; takes the arguments of
     `run_training`."""
     run_training(config, resumed, finish, report, checked=checked)
     return read_card(config.out)

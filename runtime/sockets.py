@@ -128,7 +128,7 @@ def connect(
     """A connection to the first address of (host, port) that accepts, within `timeout_s` in total.
 
     Each address gets an equal share of the remaining time, but at least CONNECT_S if that is left.
-    Raises the first OSError. The arguments are those of `socket.create_connection`.
+    Raises the first OSError. Takes the same arguments as `socket.create_connection`.
     """
     host, port = place
     addresses = _addresses(host, port)

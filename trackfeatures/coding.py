@@ -1,7 +1,7 @@
 """Encodes features in m and rad as the six training targets of the network, and decodes them.
 
-`y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are those of `TARGETS`. An
-absent distance is NaN in m; it is coded as the end of its range that is farther from the car. An
+`y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are in the order of `TARGETS`.
+An absent distance is NaN in m; it is coded as the end of its range that is farther from the car. An
 unknown distance is infinite in m and NaN when coded.
 """
 

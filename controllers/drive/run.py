@@ -73,9 +73,10 @@ def drive(
 ) -> DriveResult:
     """Drive as `config` describes; `progress` and the `observers` are called in each step.
 
-    `parameters` of the controller replace those of the file in `config`. The log and the film are
-    written step by step, so an interrupted drive leaves the driven part. Raises UserError for an
-    unknown name, a lane or start outside the road, or a service that does not answer.
+    `parameters` replace the controller's parameters in the file that `config` names. The log and
+    the film are written step by step, so an interrupted drive leaves the driven part. Raises
+    UserError for an unknown name, a lane or start outside the road, or a service that does not
+    answer.
     """
     check_light(config.light)  # a misspelt name is an error even without a camera
     if config.video is not None:
@@ -175,7 +176,8 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """`perceive` with the latency and losses of `config`, and less weight on uncertain answers.
+    """A perception: `perceive` with the latency and losses of `config`, in which uncertain answers
+    have less weight.
 
     The state is predicted over the latency, but not over the further delay `unknown_s` (s).
     """

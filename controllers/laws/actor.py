@@ -105,8 +105,8 @@ def is_actor(folder: Path) -> bool:
 def load_actor(folder: Path) -> Actor:
     """The actor in `folder`.
 
-    Raises ActorError for missing or damaged files, and for those of another state or version, which
-    would steer the car off the road.
+    Raises ActorError for missing or damaged files, and for an actor of another state or version,
+    which would steer the car off the road.
     """
     card = _read_card(folder / CARD)
     path = folder / WEIGHTS

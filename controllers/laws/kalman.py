@@ -175,7 +175,7 @@ def advance(
 def predict(
     x: Vector, covariance: Vector, table: Vector, vx: float, wheel: float, process: Vector
 ) -> None:
-    """Replace state (5,) and covariance (5, 5) by those of the next control step."""
+    """Replace state (5,) and covariance (5, 5) by their predictions for the next control step."""
     place = (min(max(vx, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
     low = min(int(place), len(table) - 2)
     share = place - low

@@ -45,7 +45,7 @@ FIRST_SEED = 1000
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """One recording; its options beyond the first two are those of `datagen collect`."""
+    """One recording; all options but the first two are also options of `datagen collect`."""
 
     controller: options.ControllerName = "lqr"
     model: Annotated[str, f"Model that perceives: {options.MODELS}"] = "default"
@@ -68,9 +68,10 @@ class RecordConfig:
 def record(config: RecordConfig, as_json: bool) -> None:
     """Record rounds with true labels while a controller steers on a model's answers.
 
-    The rounds are planned as those of `datagen collect`. The controller follows their courses,
-    which sway and leave the lane, at their speed and in their traffic. A car that leaves the road
-    or hits something is put back onto the road. The same command continues an interrupted dataset.
+    The rounds are planned like the rounds of `datagen collect`. The controller follows their
+    courses, which sway and leave the lane, at their speed and in their traffic. A car that leaves
+    the road or hits something is put back onto the road. The same command continues an interrupted
+    dataset.
     """
     from controllers.record.law import MakePerceivedLaw
 

@@ -21,7 +21,7 @@ EXPLORATION_NOISE = 0.05
 
 @dataclass(frozen=True)
 class Algorithm:
-    """The settings of an algorithm; the defaults are those of `ddpg`."""
+    """The settings of an algorithm; the defaults are the settings of `ddpg`."""
 
     critics: int = 1
     """Number of critics; the target uses the smallest of their values."""

@@ -1,7 +1,7 @@
 """Features of a LeRobot export, and their columns in its parquet files.
 
 Source: LeRobotDataset v3.0, github.com/huggingface/lerobot. Vectors are float32; an absent distance
-is NaN, because LeRobot's tensors hold no nulls. Units and signs are those of the recording.
+is NaN, because LeRobot's tensors hold no nulls. Units and signs are the same as in the recording.
 """
 
 import json
@@ -55,7 +55,8 @@ def features(camera: CameraParameters) -> dict[str, Any]:
 
 
 def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int) -> Columns:
-    """Numbers of an episode, one row per frame; `first` is the index of its first frame."""
+    """The columns of an episode by name, one row per frame, without the images. `first`: index of
+    the episode's first frame in the dataset."""
     rows = [_row(step) for step in steps]
     found: Columns = {
         name: np.array([[row[part] for part in parts] for row in rows], np.float32)
@@ -70,7 +71,7 @@ def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int
 
 
 def _row(step: Step) -> dict[str, Any]:
-    """Numbers of a frame by name; absent ones are None, which becomes NaN."""
+    """The values of a frame by name; absent values are None, which becomes NaN."""
     row = values(step.labels) | values(step.ego) | values(step.command)
     return row | {"heading": step.labels.heading}
 

@@ -1,7 +1,7 @@
 """The output folder of an export, written atomically.
 
 It is written as `.NAME.partial` beside the target and renamed when complete, so that a killed
-export is never taken for a complete one. The next export deletes such a leftover.
+export is never taken for a complete one. The next export deletes an incomplete folder.
 """
 
 import os

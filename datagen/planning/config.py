@@ -22,7 +22,7 @@ FRAMES_PER_SCENE = 200
 """Default number of frames for each scene; building one takes as long as about 15 frames."""
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
-"""With more rounds, the seeds would overlap with those of another plan."""
+"""With more rounds, the seeds would overlap with the seeds of another plan."""
 
 
 def all_lights() -> tuple[str, ...]:

@@ -31,8 +31,8 @@ def encode(image: NDArray[np.uint8], codec: str) -> bytes:
 def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
     """Decode a JPEG or PNG into `out` (H, W, 3) uint8 RGB, contiguous.
 
-    Raises ValueError for a damaged image, another format or another size. JPEG pixels are those of
-    libjpeg-turbo.
+    Raises ValueError for a damaged image, another format or another size. JPEG files give the
+    pixels that libjpeg-turbo decodes.
     """
     if data[:2] == JPEG_MAGIC:
         import simplejpeg

@@ -1,6 +1,6 @@
 """Contents of a round for viewers: images, markings, poses, boxes, and named series over time.
 
-Frames and units are those of the recording; absent values of a series are None.
+Frames and units are the same as in the recording; absent values of a series are None.
 """
 
 from collections.abc import Iterable

@@ -60,7 +60,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class RoadFit:
-    """Result for one picture; standard deviations are those of the fit alone."""
+    """Result for one picture; the standard deviations include the error of the fit only."""
 
     x0: float
     y0: float

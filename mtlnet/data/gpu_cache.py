@@ -1,7 +1,7 @@
 """A dataset in GPU memory: images are decoded once, and each batch indexes into them.
 
-The batches are those of the loader (`mtlnet.data.loader`), in the same order. A training step of
-the paper's network takes about one millisecond on a data-centre GPU, less than decoding or
+The batches are the same as the loader's (`mtlnet.data.loader`), in the same order. A training step
+of the paper's network takes about one millisecond on a data-centre GPU, less than decoding or
 augmenting 32 images on the CPU.
 """
 

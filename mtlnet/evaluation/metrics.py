@@ -37,8 +37,8 @@ def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> N
 
 
 def error_percentiles(errors: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:
-    """By feature: mean, median, 95th and 99th percentile of the absolute error, and number of
-    frames."""
+    """For each feature by name: mean, median, 95th and 99th percentile of the absolute error, and
+    number of frames."""
     return {name: _percentiles(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
 
 
@@ -67,7 +67,8 @@ def confusion(
 
 
 def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | None]]:
-    """By feature: shares of errors (N, 7) within one and two standard deviations (N, 7).
+    """For each feature by name: shares of its errors (N, 7) within one and two of its standard
+    deviations (N, 7).
 
     A normal distribution has 0.683 and 0.954.
     """
@@ -79,7 +80,8 @@ def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | 
 def calibration(
     std: NDArray[Any], errors: NDArray[np.float64]
 ) -> dict[str, list[dict[str, float]]]:
-    """By feature: predicted standard deviations and observed errors, in bins of equal count.
+    """For each feature by name: predicted standard deviations and observed errors, in bins of equal
+    count.
 
     Each bin has the root mean square of the predicted standard deviations ("said"), that of the
     errors ("found"), and the number of frames.
@@ -259,8 +261,8 @@ def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str,
 def presence(
     outputs: NDArray[np.float32], labels: LabelArrays
 ) -> dict[str, dict[str, float | None]]:
-    """By distance: share of active labels predicted as inactive, and of inactive ones predicted as
-    active."""
+    """For each distance by name: share of active labels predicted as inactive, and share of
+    inactive labels predicted as active."""
     distances, _ = tf.decode(outputs[:, :6])
     truth = labels.distances
     inactive = np.isnan(np.column_stack([distances, tf.localise(distances)]))

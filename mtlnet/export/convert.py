@@ -6,8 +6,8 @@ passed its accuracy gate on the test rounds. Each export is compared with torch 
 dataset.
 
 ONNX and OpenVINO models take any number of images at once (first axis, "batch") and give the same
-answers as for single images. The int8 graph takes one image, as the engine does, because such a
-graph is faster.
+answers as for single images. The int8 graph takes one image, as the engine does, because a graph
+for a single image is faster.
 """
 
 import logging

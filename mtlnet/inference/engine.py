@@ -173,7 +173,8 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
 
     True if the run has an int8 graph of the card's weights that passed its accuracy gate
     (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor that does not
-    may round sums differently, and uses a graph only if the gate was judged on such a processor.
+    may round sums differently, and uses a graph only if the gate was judged on a processor without
+    native int8, too.
     """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:

@@ -18,7 +18,7 @@ def count_values(x: Any) -> int:
 
 
 def is_of_one_image(x: Any) -> bool:
-    """Whether the graph is for a single image; such a graph is faster."""
+    """Whether the graph is for a single image, which makes it faster."""
     return bool(x.get_output_partial_shape(0)[0].is_static)
 
 

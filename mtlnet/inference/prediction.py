@@ -1,7 +1,7 @@
 """Decodes a model's outputs to track features, in metres and radians.
 
-Units and signs are those of `trackfeatures`: distances are negative to the left, the lateral offset
-is positive to the left, the angle is positive when the car points to the right of the track.
+Units and signs are defined in `trackfeatures`: distances are negative to the left, the lateral
+offset is positive to the left, the angle is positive when the car points to the right of the track.
 """
 
 from dataclasses import dataclass
@@ -44,8 +44,8 @@ class OutputParts:
 def split_outputs(outputs: NDArray[np.float32]) -> OutputParts:
     """Split outputs (..., 9 to 22): nine outputs, then uncertainty (8) and absence (5) if present.
 
-    The uncertainty columns are those of `mtlnet.inference.uncertainty`. Raises ValueError for
-    another number of columns.
+    `mtlnet.inference.uncertainty` defines the uncertainty columns. Raises ValueError for another
+    number of columns.
     """
     width = outputs.shape[-1] if outputs.ndim else 0
     if width not in _HAS:

@@ -44,7 +44,7 @@ Metres = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rectification:
-    """Maps images of one camera to those of another, at the same or another place of the car.
+    """Converts images of one camera to images of another, at the same or another place of the car.
 
     `source` took the images, at any size of its aspect ratio; `target`, without distortion, is the
     model's camera.

@@ -113,8 +113,8 @@ TENSOR_NAMES = {"texture_mean": "usual", "texture_directions": "directions"} | {
 
 
 def texture_features(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Texture features (C + M,) of an image (H, W, 3): those of all cells, then of the centre's
-    bands.
+    """Texture features (C + M,) of an image (H, W, 3): first all cells, then the bands of the
+    centre.
 
     Each cell or band has mean colours, and the square roots of the mean absolute differences of
     brightness between horizontal and vertical neighbours. H and W must be multiples of the numbers

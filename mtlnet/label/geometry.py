@@ -185,7 +185,7 @@ def marking_pixels(
 
 
 def handles(camera: CameraParameters, markings: Markings) -> dict[str, list[list[float]]]:
-    """By side: the pixels of the near, the middle and the far handle.
+    """For each side by name: the pixels of the near, the middle and the far handle.
 
     Where a marking leaves the picture, its handles lie at the picture's edge.
     """

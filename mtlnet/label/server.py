@@ -49,7 +49,7 @@ MAX_BODY_BYTES = 64 << 10
 MAX_SHOWN_PX = 1600
 """Maximum of the longer side of a picture sent to the page, px."""
 USUAL_LANE = -1.8, 1.8, 0.0, 0.0
-"""Initial markings without an answer of the model: those of a lane of 3.6 m with the car in its
+"""Initial markings if there is no answer of the model: a lane of 3.6 m with the car in its
 middle."""
 
 Scope = MutableMapping[str, Any]

@@ -222,7 +222,8 @@ class Residual(nn.Sequential):
 def block(
     layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0, *, skip: bool = False
 ) -> nn.Sequential:
-    """layer, [batch normalisation], ReLU, [dropout]; with `skip` as a `Residual`."""
+    """The modules in order: `layer`, batch normalisation if `norm` is given, ReLU, dropout if
+    `dropout` > 0. With `skip` they are one `Residual`."""
     parts: list[tuple[str, nn.Module]] = [("layer", layer)]
     if norm is not None:
         parts.append(("norm", norm))

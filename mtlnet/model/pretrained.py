@@ -55,7 +55,8 @@ def load_pretrained(
 
 
 def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
-    """Submodule names of the convolutions of `old`, with those of the same convolutions in `new`.
+    """Submodule names of the convolutions of `old`, each with the name of the same convolution in
+    `new`.
 
     `new` may have more residual convolutions. Raises UserError for any other difference.
     """
@@ -81,11 +82,11 @@ def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
 def restore_batch_norm(
     network: Network, biases: dict[str, Tensor], images: NDArray[np.uint8]
 ) -> None:
-    """Set the batch normalisations of a network whose filters are those of a folded model.
+    """Set the batch normalisations of a network that has the filters of a folded model.
 
-    `biases`: those of the model's convolutions, by submodule name; other convolutions are new. The
-    filters are rescaled to the size of newly initialised ones, which suits the optimizer's steps;
-    batch normalisation undoes the scale.
+    `biases`: the biases of the model's convolutions, by submodule name; other convolutions are new.
+    The filters are rescaled to the size of newly initialised ones, which suits the optimizer's
+    steps; batch normalisation undoes the scale.
     """
     network.eval()
     device = network.target_mean.device

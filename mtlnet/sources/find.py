@@ -35,7 +35,7 @@ class Source:
     """Number of images; for a film as declared in its header; 0: unknown."""
     fps: float = DEFAULT_FPS
     problem: str = ""
-    """Why no image can be read from it; empty: nothing is known to be wrong."""
+    """Why no image can be read from it; empty if no problem is known."""
     address: str = ""
     """Name of a webcam, or address of a stream without the password."""
     opened: "Stream | Recording | None" = None

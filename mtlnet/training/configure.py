@@ -27,11 +27,13 @@ from trackfeatures.errors import UserError
 
 DATASET = Path("datasets/default")
 RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
-"""Fields that may change when a run is resumed; a change of any other makes it a different run."""
+"""Fields that may change when a run is resumed; a change of any other field makes it another
+run."""
 
 
 def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
-    """The configuration of a new run; defaults are those of the recipe, network or `init` model."""
+    """The configuration of a new run; defaults come from the recipe, the network or the `init`
+    model."""
     if out is None and read_rank().world_size > 1:
         raise UserError("give --out: several processes must use the same folder for the run")
     values: dict[str, Any] = {"data": DATASET, "recipe": "fast"}

@@ -210,7 +210,7 @@ def dropout_masks(
     """Dropout masks (count, units), one for each layer of `units`, scaled by 1 / (1 - probability).
 
     They are a function of the seed, so that a run can be resumed without the state of a generator.
-    `part` (index, count): this process's part; the masks of all parts are those of a single
+    `part` (index, count): this process's part; all parts together have the masks of a single
     process.
     """
     if not probability:

@@ -93,7 +93,7 @@ def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float
 
 
 def view_homography(camera: CameraParameters, pitch: float, log_zoom: float) -> NDArray[np.float64]:
-    """Homography (3, 3) from pixels of `camera` to those of a camera with another view.
+    """Homography (3, 3) from pixels of `camera` to pixels of a camera with another view.
 
     The other camera is pitched down by `pitch` (rad) and sees exp(`log_zoom`) times as far to the
     sides.

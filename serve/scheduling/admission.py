@@ -26,7 +26,7 @@ class Admission:
     """Admits large images by their estimated decoding time. Use it in the event loop's thread."""
 
     def __init__(self, waiting: FairQueue) -> None:
-        """`waiting` knows whether other clients are present."""
+        """`waiting`: the queue, which tells whether other clients are present."""
         self._waiting = waiting
         self._pending_ms = 0.0
         self._client_ms: dict[Client, float] = {}  # cost of unfinished images

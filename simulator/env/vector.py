@@ -53,13 +53,13 @@ Options = TypeVar("Options", DriveOptions, RenderOptions)
 class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     """`num_envs` cars, each as in an environment `LateralControl` of its own.
 
-    The options are those of `LateralControl`. Each option of PER_CAR, and each number of `start`,
-    is one value for all cars or a list with one entry for each car. An entry that is a tuple
-    (least, greatest) is a range, from which each episode draws a number. `threads`: at most this
-    many threads step the cars; None: one for each core, but at least 32 cars a thread. `workers`:
-    so many processes draw the pictures, if there are any; None: one for each core. copy=False:
-    the pictures of an observation are those in the memory shared with the workers, which the next
-    `step` or `reset` overwrites.
+    Takes the options of `LateralControl`. Each option of PER_CAR, and each number of `start`, is
+    one value for all cars or a list with one entry for each car. An entry that is a tuple (least,
+    greatest) is a range, from which each episode draws a number. `threads`: at most this many
+    threads step the cars; None: one for each core, but at least 32 cars per thread. `workers`:
+    number of processes that draw the pictures, if there are any; None: one for each core.
+    copy=False: the pictures of an observation are the arrays in the memory shared with the workers,
+    which the next `step` or `reset` overwrites.
 
     Raises UserError for bad options and actions; its message names the car, and no car has moved.
     Raises PictureWorkerError when a worker dies; `reset` starts others.
@@ -214,7 +214,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         self._observer.restart(number, episode)
 
     def _observe(self, chosen: NDArray[np.bool_]) -> Any:
-        """The observations of all cars; those of the `chosen` ones are new."""
+        """The observations of all cars, after new observations of the `chosen` cars."""
         try:
             return self._observer.observe(chosen)
         except BaseException:  # the cars have moved, but nothing has been returned

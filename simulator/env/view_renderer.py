@@ -96,7 +96,7 @@ class ViewRenderer:
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Copies of the views of the current state, in the order of `views`.
 
-        The images are those of `Camera.render_views`, except that the depth of the sky is the bound
+        Returns the images of `Camera.render_views`, except that the depth of the sky is the bound
         of the space, 6000 m.
         """
         if world.state is not self._rendered_state:

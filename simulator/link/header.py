@@ -55,7 +55,7 @@ def _comment(field: Field) -> str:
 
 
 def _assertions(block: Block) -> str:
-    """Static assertions that the compiler's offsets equal those of the layout."""
+    """Static assertions that the compiler's offsets equal the layout's offsets."""
     struct = f"struct drvlink_{block.name}"
     lines = [
         f"DRVLINK_ASSERT(offsetof({struct}, {name}) == {offset});\n"

@@ -23,9 +23,9 @@ left the track before any part of it meets a wall."""
 class Road:
     """`lanes` lanes of `lane_width`, centred on `track`; a narrower track is widened.
 
-    `carriageway`: the lines and shoulders of a varied road; None: those of the paper's roads, with
-    one line per marking. Raises UserError for a number or width of lanes outside the definitions,
-    or that differs from the carriageway's.
+    `carriageway`: the lines and shoulders of a varied road; None: the paper's lines and shoulders,
+    with one line per marking. Raises UserError for a number or width of lanes outside the
+    definitions, or that differs from the carriageway's.
     """
 
     track: Track

@@ -16,7 +16,8 @@ class Surface:
     section_m: float = 100.0
     """Mean length of a section of either material, m."""
     concrete: float = 0.0
-    """Sections made of concrete slabs: 0 none, 1 those of both materials, -1 the second's only."""
+    """Sections made of concrete slabs: 0 none, 1 the sections of both materials, -1 of the second
+    only."""
     joint_m: float = 5.0
     """Distance between the joints of concrete slabs."""
     halves: float = 0.0

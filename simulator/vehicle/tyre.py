@@ -1,6 +1,6 @@
 """Tyre force from slip and load, with the friction ellipse. Wheel frame: x forward, y left.
 
-The magic formula and the effect of the load are those of the TORCS car model.
+The magic formula and the effect of the load are taken from the TORCS car model.
 """
 
 import math

@@ -70,7 +70,7 @@ class Messages(Protocol):
 class CheckedChunks:
     """Which chunks of a memory-mapped file were found undamaged; each is read once per process.
 
-    A CRC of 0 means that the writer computed none (mcap.dev/spec): such a chunk is taken as it is.
+    A CRC of 0 means that the writer computed none (mcap.dev/spec): the chunk is then not checked.
     """
 
     def __init__(self, view: memoryview, summary: Summary) -> None:

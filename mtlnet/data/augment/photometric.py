@@ -1,7 +1,7 @@
 """Augmentation of colour and image quality: colour, blur, noise, JPEG artefacts.
 
-Images are uint8 RGB (H, W, 3), changed in place with OpenCV. The operations are those of
-torchvision.transforms.v2, which take 3 to 30 times as long;
+Images are uint8 RGB (H, W, 3), changed in place with OpenCV. The operations are the same as in
+torchvision.transforms.v2, which takes 3 to 30 times as long;
 tests/mtlnet/data/augment/test_photometric.py compares the results.
 """
 

@@ -32,7 +32,7 @@ _ASPHALT = ((3, 4),)
 _LEFT, _RIGHT = ((0, 1), (1, 2), (2, 3)), ((4, 5), (5, 6), (6, 7))
 _FAR = ((0, 2), (2, 3), (4, 5), (5, 7))
 VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0))
-"""Levels of detail of the verge, coarser than those of the asphalt."""
+"""Levels of detail of the verge, coarser than the levels of the asphalt."""
 LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
 """Overlap of the verge below the asphalt (m), its depth there (m), and the weight of its height
 error, which keeps it below the asphalt at every level of detail."""
