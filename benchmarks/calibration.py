@@ -26,7 +26,7 @@ from benchmarks.claims.outcome import conclude, run_command
 from datagen.driving.scripted_driver import ScriptedDriver
 from datagen.driving.trajectory import make_course
 from mtlnet.calibration.drive import calibrate_film, calibrate_pictures
-from mtlnet.calibration.lens import Lens, find_lens
+from mtlnet.calibration.lens import KnownLens, find_lens
 from runtime.film import Mp4Writer
 from simulator.camera import Camera, Light
 from simulator.camera.core.optics import rotation
@@ -119,7 +119,7 @@ def _euler(turn: NDArray[np.float64]) -> tuple[float, float, float]:
 def errors(mount: Mount, path: Path) -> dict[str, float]:
     """Signed errors of the film's calibration, and its standard deviations."""
 
-    def lens(size: tuple[int, int]) -> Lens:
+    def lens(size: tuple[int, int]) -> KnownLens:
         return find_lens(size, CameraParameters(), fov_y_deg=mount.fov_y_deg)
 
     found = calibrate_film(path, lens, mount.lane_width_m).found

@@ -15,7 +15,7 @@ from mtlnet.sources.recordings.cameras import calibration_topic
 from mtlnet.sources.recordings.images import CALIBRATION, ROS_CALIBRATION
 from mtlnet.sources.recordings.recording import open_recording
 from mtlnet.sources.recordings.topic import Topic
-from tests.mtlnet.predict.test_predict import BrightnessEngine
+from tests.mtlnet.predict.brightness_engine import BrightnessEngine
 from tests.mtlnet.sources.recorded import (
     Message,
     ros_camera,

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.sources.find import find_sources
-from tests.mtlnet.predict.test_predict import BrightnessEngine
+from tests.mtlnet.predict.brightness_engine import BrightnessEngine
 from tests.mtlnet.sources.recorded import (
     START_S,
     Message,
