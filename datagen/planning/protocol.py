@@ -6,17 +6,22 @@ other cars and all trajectories. All of them are for tests.
 """
 
 from dataclasses import replace
-from math import ceil
 from pathlib import Path
 
+import numpy as np
+
+from datagen.driving.scripted_driver import ScriptedDriver
+from datagen.driving.trajectory import make_course
 from datagen.planning.class_balance import TrackForecast
 from datagen.planning.config import CollectConfig, ProtocolConfig
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.planner import make_plan
 from datagen.planning.tracks import HELD_OUT, choose_tracks
 from datagen.recording.names import MIDDLE, UNSEEN
-from simulator.driving.speed import speed_profile
 from simulator.track.catalogue import find_track
+from simulator.track.geometry import Track
+from simulator.track.road import Road
+from simulator.world.world import World
 
 NINE_TRACKS = (
     "alpine-1", "alpine-2", "e-track-2", "e-track-3", "eroad", "forza",
@@ -42,29 +47,25 @@ def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
     )
     plan = make_plan(collection, TrackForecast.of(collection.tracks, tracks_dir))
     rounds = [replace(entry, split="test") for entry in plan.rounds]
-    cases = [(track, light) for track in DRIVEN_TRACKS for light in LIGHTS]
-    seed = rounds[-1].seed + 1
-    drives = [
-        _drive(rounds[0], track, light, seed + number, config.laps, tracks_dir)
-        for number, (track, light) in enumerate(cases)
-    ]
+    drives: list[RoundPlan] = []
+    for name in DRIVEN_TRACKS:
+        track = find_track(name, tracks_dir)
+        frames = drive_frames(track, config.laps, rounds[0].frequency_hz)
+        for light in LIGHTS:
+            seed = rounds[-1].seed + 1 + len(drives)
+            drives.append(_drive(rounds[0], track, light, seed, frames))
     return replace(plan, rounds=(*rounds, *drives))
 
 
-def _drive(
-    like: RoundPlan, track: str, light: str, seed: int, laps: float, tracks_dir: Path | None
-) -> RoundPlan:
-    """A drive of `laps` laps from the start line; its other values are those of `like`."""
-    geometry = find_track(track, tracks_dir)
-    profile = speed_profile(geometry, SPEED_KMH / 3.6, innermost_y=0.0)
-    lap_s = float((profile.cell_m / profile.limit).sum())
+def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) -> RoundPlan:
+    """A drive of `frames` frames from the start line; its other values are those of `like`."""
     return replace(
         like,
-        id=f"drive-{track}-{light}",
+        id=f"drive-{track.name}-{light}",
         seed=seed,
-        split=UNSEEN if track in HELD_OUT else "test",
-        track=track,
-        track_hash=geometry.content_hash,
+        split=UNSEEN if track.name in HELD_OUT else "test",
+        track=track.name,
+        track_hash=track.content_hash,
         lanes=1,
         traffic=0,
         trajectory=MIDDLE,
@@ -72,5 +73,26 @@ def _drive(
         stretch=0,
         speed_kmh=SPEED_KMH,
         start=0.0,
-        frames=ceil(laps * lap_s * like.frequency_hz),
+        frames=frames,
     )
+
+
+def drive_frames(track: Track, laps: float, frequency_hz: int) -> int:
+    """Number of frames in which the scripted driver drives `laps` laps from the start line.
+
+    The drive is simulated without images. Its speed profile alone gives up to 11 % less: the driver
+    brakes for limits 0.5 s ahead and has to accelerate after each bend.
+    """
+    road, speed = Road(track, 1), SPEED_KMH / 3.6
+    course = make_course(MIDDLE, road, laps * track.length_m, np.random.default_rng(0))
+    driver = ScriptedDriver(road, course, speed, frequency_hz)
+    frames, driven_m = 0, 0.0
+    with World(road, frequency_hz=frequency_hz) as world:
+        state = world.reset(
+            seed=0, s=0.0, to_middle=driver.offset_at(0.0), speed=driver.speed_at(0.0)
+        )
+        while state.lap + state.s / track.length_m < laps:
+            state = world.step(driver.command(state, world.traffic, driven_m))
+            driven_m += state.speed / frequency_hz
+            frames += 1
+    return frames

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import LabelArrays
+from mtlnet.inference.trained_rounds import Seeds, names_entry
 from trackfeatures.definitions import UNKNOWN_HEADING
 
 
@@ -16,12 +17,14 @@ def describe_data(
 ) -> dict[str, Any]:
     """Description of a model's training data; `mean`, the mean of the labels, is the baseline.
 
-    `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks are
-    listed as seen by the model; `frames` does not include their frames.
+    `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks count
+    as seen by the model; `frames` does not include their frames. The entries `split`, `held_out`
+    and `seeds` are those of `mtlnet.inference.trained_rounds`.
     """
-    rounds = [*frames.rounds, *(held_out.rounds if held_out is not None else [])]
+    fitted = held_out.rounds if held_out is not None else []
+    rounds = [*frames.rounds, *fitted]
     splits = {
-        split: [info.id for info in dataset.rounds if info.split == split]
+        split: names_entry(info.id for info in dataset.rounds if info.split == split)
         for split in ("train", "test")
     }
     return {
@@ -29,8 +32,8 @@ def describe_data(
         "content_hash": dataset.content_hash,
         "frames": len(frames),
         "split": splits,
-        "held_out": [info.id for info in held_out.rounds] if held_out is not None else [],
-        "seeds": [info.seed for info in rounds],
+        "held_out": names_entry(info.id for info in fitted),
+        "seeds": Seeds.of(info.seed for info in rounds).entry(),
         "tracks": sorted({info.track for info in rounds}),
         "mean": mean_labels(frames.labels),
     }

@@ -23,6 +23,7 @@ from mtlnet.evaluation.picture_page import write_picture_page
 from mtlnet.evaluation.pictures import judge, picture_report
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.model_card import ModelCard, ModelError
+from mtlnet.inference.trained_rounds import Seeds
 from runtime.files import check_folder
 from trackfeatures.errors import UserError
 
@@ -173,7 +174,8 @@ def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
         )
     if split not in ("test", "unseen"):
         return
-    seen = {info.seed for info in frames.rounds} & set(card.data["seeds"])
+    trained = Seeds.read(card.data["seeds"])
+    seen = [info.seed for info in frames.rounds if info.seed in trained]
     if seen:
         raise ModelError(
             f"model {card.name} was trained on the round of seed {min(seen)}, a {split} round of "

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from datagen.recording import Dataset
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.data.custom_images import LABELS, has_labels_file
-from mtlnet.data.rounds import hold_out_rounds, select_rounds
+from mtlnet.data.rounds import hold_out_rounds
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (
     FLOAT_ACTIVATIONS,
@@ -42,6 +42,7 @@ from mtlnet.inference.model_card import (
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.trained_rounds import names_entry
 from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.network import Network, load_network, predict_images
 from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph
@@ -120,15 +121,16 @@ def export_model(
 def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
     """The int8 form of a graph, and the numbers of the convolutions with float activations.
 
-    These are chosen on the rounds that fitted the uncertainty head, if they belong to `dataset`;
-    otherwise on a part of the dataset's train rounds, which the calibration then does not use.
+    These are chosen on the rounds that fitted the uncertainty head, if they are a part of
+    `dataset`, divided as at that time; otherwise on a part of the dataset's train rounds, which the
+    calibration then does not use.
     """
     fitted = card.uncertainty or {}
-    names = fitted.get("held_out", [])
+    train, held_out = parts = hold_out_rounds(dataset)
     if fitted.get("content_hash", card.data.get("content_hash")) == dataset.content_hash:
-        train, held_out = dataset.select("train"), select_rounds(dataset, names) if names else None
-    else:
-        train, held_out = hold_out_rounds(dataset)
+        for part in filter(None, parts):
+            if names_entry(info.id for info in part.rounds) == fitted.get("held_out"):
+                train, held_out = dataset.select("train"), part
     images, chosen = calibration_images(train), FLOAT_ACTIVATIONS
     if held_out is not None:
         chosen = choose_float_activations(graph, images, held_out, card.data["mean"])

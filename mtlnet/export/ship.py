@@ -19,7 +19,7 @@ from safetensors.numpy import save
 
 from mtlnet.architecture import HEIGHT, WIDTH, find_architecture
 from mtlnet.evaluation.metrics import GROUPS
-from mtlnet.inference.engine import Engine, has_openvino, load_engine
+from mtlnet.inference.engine import INT8, Engine, has_openvino, load_engine, read_export
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
@@ -31,6 +31,7 @@ from mtlnet.inference.model_card import (
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.trained_rounds import Seeds
 from mtlnet.inference.uncertainty import write_uncertainty_head
 from mtlnet.inference.weights_file import read_weights
 from mtlnet.model.network import load_network, predict_images
@@ -62,8 +63,9 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
         raise UserError(f"{out} already holds a model; give another --out or delete it")
     refitted = None if data is None else refit_uncertainty_head(run, data)
     if refitted is not None:
-        seeds = sorted({*card.data["seeds"], *refitted.about["seeds"]})
-        card = replace(card, uncertainty=refitted.about, data={**card.data, "seeds": seeds})
+        seeds = Seeds.read(card.data["seeds"]) | Seeds.read(refitted.about["seeds"])
+        seen = {**card.data, "seeds": seeds.entry()}
+        card = replace(card, uncertainty=refitted.about, data=seen)
     names = (WEIGHTS,) if card.uncertainty is None else (WEIGHTS, UNCERTAINTY_WEIGHTS)
     check_files(run, card, names if refitted is None else (WEIGHTS,))
     out.mkdir(parents=True, exist_ok=True)
@@ -148,13 +150,14 @@ def _answers(engine: Engine, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.
 def write_page(
     model: Path, evaluations: Sequence[Path], notes: str = "", picture: Path | None = None
 ) -> Path:
-    """Write `README.md` to the model's folder: its card, `notes`, and the tables of evaluations.
+    """Write `README.md` to the model's folder: its card, `notes`, the figures by which its int8
+    graph was judged, if it has one, and the tables of evaluations.
 
     `evaluations`: files with the output of `mtlnet evaluate --json`; `picture`: a JPEG of the worst
     frames, which is copied to the folder. Raises UserError for an evaluation that is unreadable or
     of another model.
     """
-    card = read_card(model)
+    card, int8 = read_card(model), read_export(model / INT8) or {}
     found = [_read_evaluation(path, card) for path in evaluations]
     environment = Environment(
         loader=PackageLoader("mtlnet.export", ""), undefined=StrictUndefined, autoescape=False
@@ -162,6 +165,7 @@ def write_page(
     page = environment.get_template("model_page.md").render(
         card=card,
         notes=notes.strip(),
+        gate=int8.get("gate") if int8.get("model_hash") == card.model_hash else None,
         evaluations=found,
         picture=PICTURE if picture is not None else "",
         groups=GROUPS,

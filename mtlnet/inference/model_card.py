@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mtlnet.inference.trained_rounds import shortened
 from runtime.files import file_hash, write_json
 from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError, require_version
@@ -28,7 +29,9 @@ SHIPPED_FILES = {
 }
 """SHA-256 of the shipped model's files."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 5  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
+FORMAT = 6  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
+LISTING_FORMAT = 5
+"""The format that lists every round; it is read, too (`mtlnet.inference.trained_rounds`)."""
 
 
 class ModelError(UserError):
@@ -99,12 +102,18 @@ def read_card(run: Path) -> ModelCard:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = content["format"]
-        if found != FORMAT:
-            raise ModelError(f"{path} has format {found}, this program reads {FORMAT}; train anew")
+        if found not in (LISTING_FORMAT, FORMAT):
+            raise ModelError(
+                f"{path} has format {found}, this program reads {LISTING_FORMAT} and {FORMAT}; "
+                "train anew"
+            )
         values = {field.name: content[field.name] for field in fields(ModelCard)}
         values["camera"] = CameraParameters(**values["camera"])
         values["alpha"] = tuple(values["alpha"])
         values["golden"] = tuple(values["golden"])
+        values["data"] = shortened(values["data"])
+        if values["uncertainty"] is not None:
+            values["uncertainty"] = shortened(values["uncertainty"])
         require_name(values["name"], "model's name")
         for name in values["files"]:
             require_name(name, "name of a model's file")

@@ -42,12 +42,6 @@ def split_scores(distance: Tensor, angle: Tensor, heading: Tensor) -> Scores:
     return Scores(distance.reshape(-1, len(tf.MARKINGS), DISTANCE_BINS + 1), angle, heading)
 
 
-def bin_centres(low: float, high: float, count: int) -> list[float]:
-    """The centres of `count` equal bins between `low` and `high`."""
-    width = (high - low) / count
-    return [low + width * (k + 0.5) for k in range(count)]
-
-
 def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tensor:
     """Target probabilities (..., `count`) of equal bins between `low` and `high` for values (...).
 

@@ -18,6 +18,7 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
+from mtlnet.inference.trained_rounds import shortened
 from mtlnet.training.config import CONFIG, TrainConfig
 from mtlnet.training.device import choose_device
 from mtlnet.training.distributed import read_rank
@@ -99,7 +100,7 @@ def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
         tf.require_version(content["definitions"], f"the run in {run}")
         values = content["config"]
         values.update(data=Path(values["data"]), out=run, alpha=tuple(values["alpha"]))
-        return TrainConfig(**values), content["data"]
+        return TrainConfig(**values), shortened(content["data"])
     except (ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} is damaged ({error!r}); start a new run") from error
 

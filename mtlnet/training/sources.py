@@ -20,6 +20,7 @@ from mtlnet.data.rounds import (
     require_decodable,
 )
 from mtlnet.inference.model_card import ModelCard, ModelError
+from mtlnet.inference.trained_rounds import Seeds, names_entry
 from mtlnet.model.pretrained import match_convolutions
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.recipes import find_recipe
@@ -99,9 +100,9 @@ def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "")
         "path": str(folder),
         "content_hash": images.content_hash,
         "frames": len(images),
-        "split": {"train": [str(folder)], "test": []},
-        "held_out": [],
-        "seeds": [],
+        "split": {"train": names_entry([str(folder)]), "test": names_entry([])},
+        "held_out": names_entry([]),
+        "seeds": Seeds.of([]).entry(),
         "tracks": [],
         "mean": mean_labels(images.labels),
         "held_out_drives": held_out,
@@ -196,11 +197,12 @@ def _summary(data: dict[str, Any]) -> dict[str, Any]:
 
 def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
     """The description `about` with the rounds and tracks of `earlier` added as seen."""
-    names = [name for name in ("seeds", "tracks", "pictures") if name in about or name in earlier]
+    names = [name for name in ("tracks", "pictures") if name in about or name in earlier]
     seen: dict[str, Any] = {
         name: sorted({*about.get(name, ()), *earlier.get(name, ())}) for name in names
     }
-    return {**about, **seen}
+    seeds = Seeds.read(about["seeds"]) | Seeds.read(earlier.get("seeds", ()))
+    return {**about, **seen, "seeds": seeds.entry()}
 
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:

@@ -25,6 +25,7 @@ from mtlnet.data.rounds import (
 )
 from mtlnet.evaluation.metrics import coverage
 from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
+from mtlnet.inference.trained_rounds import Seeds, names_entry
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
     FEATURES,
@@ -122,9 +123,10 @@ def fit_uncertainty_head(
         **pitch_layers,
     )
     judged = unseen or known
+    rounds = held_out.rounds if isinstance(held_out, Frames) else []
     about = {
         "features": list(FEATURES),
-        "held_out": [info.id for info in held_out.rounds] if isinstance(held_out, Frames) else [],
+        "held_out": names_entry(info.id for info in rounds),
         "frames": len(judged.x),
         "false_alarm_rate": FALSE_ALARM_RATE,
         "coverage": coverage(head.predict(judged.x, judged.texture)[:, :-1], judged.error),
@@ -149,7 +151,8 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
         )
     require_camera(card, dataset.camera)
     seeds = [info.seed for info in (*many.rounds, *few.rounds)]
-    seen = set(seeds) & set(card.data["seeds"])
+    trained = Seeds.read(card.data["seeds"])
+    seen = [seed for seed in seeds if seed in trained]
     if seen:
         raise ModelError(
             f"model {card.name} was trained on the round of seed {min(seen)} of {data}; collect "
@@ -157,7 +160,11 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
         )
     network = load_network(run / WEIGHTS, card.network)
     fitted = fit_uncertainty_head(network, few, many, card.seed, card.camera)
-    origin = {"data": dataset.path.name, "content_hash": dataset.content_hash, "seeds": seeds}
+    origin = {
+        "data": dataset.path.name,
+        "content_hash": dataset.content_hash,
+        "seeds": Seeds.of(seeds).entry(),
+    }
     return replace(fitted, about={**fitted.about, **origin})
 
 

@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
+from mtlnet.export.ship import write_page
 from mtlnet.inference.engine import INT8, int8_graph, load_engine, read_export
 from mtlnet.inference.model_card import SHIPPED, SHIPPED_FILES, ModelError, read_card, resolve_run
+from mtlnet.inference.trained_rounds import Seeds
 from runtime.files import file_hash
 from runtime.processor import has_int8
 from tests.typed import typed
@@ -59,6 +61,28 @@ def test_other_weights_in_the_place_of_the_shipped_ones_are_refused(
     (tmp_path / "card.json").write_text(json.dumps(card))
     with pytest.raises(ModelError, match="does not hold the weights of this version"):
         read_card(resolve_run("default"))
+
+
+def test_the_card_of_the_shipped_model_is_short() -> None:
+    card = read_card(SHIPPED)
+    assert len((SHIPPED / "card.json").read_text().splitlines()) < 300
+    assert json.loads((SHIPPED / "card.json").read_text())["data"] == card.data
+    assert Seeds.read(card.data["seeds"]).count > 1000
+
+
+def test_the_page_of_the_shipped_model_has_the_figures_of_its_card_and_its_int8_graph(
+    tmp_path: Path,
+) -> None:
+    """Without the notes and evaluations, which only its author has."""
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    head, int8 = write_page(tmp_path, []).read_text().split("## The int8 graph")
+    found = (SHIPPED / "README.md").read_text()
+    assert found.startswith(head.rstrip())
+    assert f"## The int8 graph{int8.rstrip()}\n" in found
+    worse = read_export(SHIPPED / INT8)["gate"]["worse"]  # type: ignore[index]
+    assert f"| `ml` (m) | {worse['ml']:+.4f} | 0.003 |" in int8
+    assert f"| `angle` (rad) | {worse['angle']:+.5f} | 0.0002 |" in int8
+    assert f"| wrong class (points) | {100 * worse['accuracy']:+.2f} | 0.1 |" in int8
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import pytest
 import typer.testing
 
 from datagen.cli import app
+from datagen.driving.scripted_driver import ScriptedDriver
 from datagen.driving.trajectory import TRAJECTORIES, make_course
 from datagen.planning import protocol
 from datagen.planning.config import ProtocolConfig
@@ -17,6 +18,7 @@ from datagen.planning.protocol import NINE_TRACKS, protocol_plan
 from datagen.recording.names import MIDDLE
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
+from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 
@@ -57,6 +59,26 @@ def test_a_drive_takes_as_long_as_its_lap(monkeypatch: pytest.MonkeyPatch) -> No
         ProtocolConfig(laps=0)
 
 
+def test_a_drive_is_one_whole_lap() -> None:
+    """Its own course, drawn from the seed of its round, takes as many frames to 0.2 % of a lap."""
+    road = Road(find_track("town"), 1)
+    frames = protocol.drive_frames(road.track, 1.0, 20)
+    course = make_course(MIDDLE, road, 2000.0, np.random.default_rng([1810, 3]))
+    driver = ScriptedDriver(road, course, 65 / 3.6)
+    places = []
+    with World(road) as world:
+        state = world.reset(
+            seed=1, s=0.0, to_middle=driver.offset_at(0.0), speed=driver.speed_at(0.0)
+        )
+        for frame in range(frames):
+            places.append(state.lap + state.s / road.track.length_m)
+            state = world.step(driver.command(state, world.traffic, frame * 65 / 3.6 / 20))
+    step = 65 / 3.6 / 20 / road.track.length_m
+    assert places[0] == pytest.approx(0.0, abs=1e-5)
+    assert places[-1] == pytest.approx(1.0 - step, abs=0.002)
+    assert np.diff(places).max() <= 1.01 * step
+
+
 def test_the_command_records_this_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(protocol, "NINE_TRACKS", ("oval",))
     monkeypatch.setattr(protocol, "DRIVEN_TRACKS", ("oval", "coast"))
@@ -80,5 +102,5 @@ def test_the_plan_is_as_large_as_the_papers_test_set() -> None:
     assert {entry.track for entry in rounds} == set(NINE_TRACKS)
     assert set(Counter(entry.lanes for entry in rounds).values()) <= {4, 5, 6}
     assert [(d.track, d.frames) for d in drives] == [
-        ("g-track-3", 3355), ("g-track-3", 3355), ("dirt-3", 2607), ("dirt-3", 2607),
+        ("g-track-3", 3453), ("g-track-3", 3453), ("dirt-3", 2701), ("dirt-3", 2701),
     ]  # fmt: skip

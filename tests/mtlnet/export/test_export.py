@@ -15,6 +15,7 @@ from safetensors.numpy import load_file
 import mtlnet.export.convert
 import mtlnet.export.int8
 from datagen.recording import Dataset, Frames
+from mtlnet.data.rounds import select_rounds
 from mtlnet.evaluation.tables import export_lines
 from mtlnet.export.convert import export_model, write_openvino
 from mtlnet.export.int8 import (
@@ -41,6 +42,7 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
+from mtlnet.inference.trained_rounds import names_entry
 from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.network import Network, fold, load_network
 from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
@@ -247,26 +249,45 @@ def test_float_activations_are_chosen_on_held_out_rounds(
     assert tried == [(), *((number,) for number in order), *pairs]
 
 
-def test_float_activations_are_chosen_on_data_of_another_training_too(
-    trained: Path, dataset: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("held_out", "fitted_on", "expected"),
+    [
+        (["r002"], "these rounds", ("r000 r001 r002", "r002")),
+        (["r000", "r001"], "these rounds", ("r000 r001 r002", "r000 r001")),
+        (["r001"], "these rounds", ("r000 r001", "r002")),  # divided otherwise at that time
+        (["r002"], "others", ("r000 r001", "r002")),
+    ],
+)
+def test_float_activations_are_chosen_on_the_rounds_that_fitted_the_head(
+    trained: Path,
+    dataset: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    held_out: list[str],
+    fitted_on: str,
+    expected: tuple[str, str],
 ) -> None:
-    card, data = read_card(trained), Dataset.open(dataset)
-    rounds = data.select("train")
-    other = replace(card, data={**card.data, "content_hash": "of other rounds"})
-    later = {"held_out": ["round-0000"], "content_hash": "of later rounds"}
-    seen: list[Frames] = []
+    """The card has the digest of these rounds. On data of another fit they are a part of it, and
+    the calibration uses the rest."""
+    card, data = read_card(trained), replace(Dataset.open(dataset), content_hash="these rounds")
+    about = {"held_out": names_entry(held_out), "content_hash": fitted_on}
+    seen: list[str] = []
+
+    def note(frames: Frames) -> str:
+        seen.append(" ".join(info.id for info in frames.rounds))
+        return seen[-1]
 
     def choose(_graph: Any, _images: Any, held_out: Frames, _mean: Any) -> tuple[int, ...]:
-        seen.append(held_out)
+        note(held_out)
         return (1,)
 
-    monkeypatch.setattr(mtlnet.export.convert, "hold_out_rounds", lambda _: (rounds, rounds))
+    parts = select_rounds(data, ["r000", "r001"]), select_rounds(data, ["r002"])
+    monkeypatch.setattr(mtlnet.export.convert, "hold_out_rounds", lambda _: parts)
+    monkeypatch.setattr(mtlnet.export.convert, "calibration_images", note)
     monkeypatch.setattr(mtlnet.export.convert, "choose_float_activations", choose)
     monkeypatch.setattr(mtlnet.export.convert, "quantise", lambda graph, _, chosen: (graph, chosen))
-    for model in (other, replace(card, uncertainty=later)):
-        found = mtlnet.export.convert._quantised("graph", model, data)
-        assert found == (("graph", (1,)), (1,))
-    assert seen == [rounds, rounds]
+    found = mtlnet.export.convert._quantised("graph", replace(card, uncertainty=about), data)
+    assert found == (("graph", (1,)), (1,))
+    assert tuple(seen) == expected
 
 
 def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path: Path) -> None:

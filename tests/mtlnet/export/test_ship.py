@@ -15,8 +15,10 @@ from safetensors.numpy import save
 from datagen.recording import Dataset
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.evaluation.evaluate import evaluate
+from mtlnet.export.convert import write_export
+from mtlnet.export.int8 import gate
 from mtlnet.export.ship import half, ship_model, write_page
-from mtlnet.inference.engine import load_engine
+from mtlnet.inference.engine import INT8, load_engine
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
 from mtlnet.inference.weights_file import read_weights
@@ -99,9 +101,10 @@ def test_its_standard_deviations_are_fitted_anew_on_other_rounds(
     assert card.files[WEIGHTS] == earlier.files[WEIGHTS]
     assert card.files[UNCERTAINTY_WEIGHTS] != earlier.files[UNCERTAINTY_WEIGHTS]
     assert card.uncertainty is not None
-    assert (card.uncertainty["data"], len(card.uncertainty["held_out"])) == (later.name, 8)
-    assert sorted(card.uncertainty["seeds"]) == list(range(100, 109))
-    assert card.data == {**earlier.data, "seeds": [*earlier.data["seeds"], *range(100, 109)]}
+    assert (card.uncertainty["data"], card.uncertainty["held_out"]["count"]) == (later.name, 8)
+    assert card.uncertainty["seeds"] == {"count": 9, "ranges": "100..108"}
+    assert earlier.data["seeds"] == {"count": 3, "ranges": "0..2"}
+    assert card.data == {**earlier.data, "seeds": {"count": 12, "ranges": "0..2 100..108"}}
     frame = Dataset.open(later).select("test").image(0)
     found, before = (load_engine(run, "openvino", "f32")(frame) for run in (out, shipped))
     np.testing.assert_allclose(found[9:], load_engine(out, "torch")(frame)[9:], rtol=5e-3)
@@ -211,8 +214,16 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     continued = tmp_path / "continued"
     shutil.copytree(shipped, continued)
     replace(engine.card, data=data).write(continued)
+    judged = gate(found, {**found, "angle_mae_rad": found["angle_mae_rad"] + 3e-4})
+    (continued / INT8).mkdir(parents=True)
+    write_export(continued / INT8, engine.card, (), gate=judged)
     page = write_page(continued, [file]).read_text()
     assert "Before on 250000 other frames (content hash `c0ffee`)." in page
+    assert "It failed its accuracy gate: errors above those of float32, on 24 test frames." in page
+    assert "| `ml` (m) | +0.0000 | 0.003 |\n| `mr` (m) |" in page
+    assert "| `angle` (rad) | +0.00030 | 0.0002 |\n| wrong class (points) | +0.00 | 0.1 |" in page
+    write_export(continued / INT8, replace(engine.card, files={WEIGHTS: "0"}), (), gate=judged)
+    assert "int8" not in write_page(continued, [file]).read_text()
 
     file.write_text(json.dumps({**found, "model_hash": "0" * 64}))
     with pytest.raises(UserError, match="other weights than these"):

@@ -160,7 +160,7 @@ def test_a_model_of_another_format_version_is_refused(copy: Path) -> None:
     content = json.loads((copy / "card.json").read_text())
     content["format"] = 1
     (copy / "card.json").write_text(json.dumps(content))
-    with pytest.raises(ModelError, match="has format 1, this program reads 5"):
+    with pytest.raises(ModelError, match="has format 1, this program reads 5 and 6"):
         load_engine(copy)
 
 

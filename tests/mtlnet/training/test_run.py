@@ -16,6 +16,7 @@ from datagen.recording import Dataset
 from mtlnet.data.loader import Loader
 from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import GRAPH, UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
+from mtlnet.inference.trained_rounds import names_entry
 from mtlnet.model.cpu_kernels.forward import training_outputs
 from mtlnet.train import train
 from mtlnet.training.checkpoint import list_checkpoints
@@ -127,7 +128,7 @@ def test_a_run_stores_its_configuration_data_and_curves(dataset: Path, tmp_path:
     assert done.export_check["openvino_f32_max"] < 2e-4
     assert set(done.files) == {WEIGHTS, UNCERTAINTY_WEIGHTS, GRAPH, "model.bin"}
     assert done.data["content_hash"] == Dataset.open(dataset).content_hash
-    assert done.data["split"]["test"] == ["r003"]
+    assert done.data["split"]["test"] == names_entry(["r003"])
     labels = Dataset.open(dataset).select("train").labels
     assert done.data["mean"]["angle_rad"] == pytest.approx(labels.angle.mean(), abs=1e-6)
     stored = json.loads((run / "config.json").read_text())

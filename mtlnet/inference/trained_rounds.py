@@ -1,0 +1,98 @@
+"""The rounds of a training as a model's card has them: seeds as ranges, names as a digest.
+
+The card of format 5, and the `config.json` of runs from that time, list every seed and every name;
+`shortened` reads both forms.
+"""
+
+import hashlib
+import json
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """A set of seeds of rounds. The seeds of a collection are consecutive."""
+
+    ranges: tuple[range, ...]
+    """Disjoint, in order, with a gap between two of them."""
+
+    @staticmethod
+    def of(seeds: Iterable[int]) -> "Seeds":
+        """The set of these seeds."""
+        return _merged(range(seed, seed + 1) for seed in seeds)
+
+    @staticmethod
+    def read(entry: Mapping[str, Any] | Iterable[int]) -> "Seeds":
+        """The seeds of a card's entry, or a list of them. Raises ValueError for a damaged entry."""
+        if not isinstance(entry, Mapping):
+            return Seeds.of(entry)
+        seeds = _merged(_range(text) for text in entry["ranges"].split())
+        if seeds.count != entry["count"]:
+            raise ValueError(f"{seeds.count} seeds instead of {entry['count']}")
+        return seeds
+
+    def entry(self) -> dict[str, Any]:
+        """The entry for a card: {"count": 4, "ranges": "1..3 7"}; both ends belong to a range."""
+        texts = [
+            f"{part.start}..{part[-1]}" if part[1:] else str(part.start) for part in self.ranges
+        ]
+        return {"count": self.count, "ranges": " ".join(texts)}
+
+    @property
+    def count(self) -> int:
+        """Number of seeds."""
+        return sum(part.stop - part.start for part in self.ranges)
+
+    def __contains__(self, seed: int) -> bool:
+        before = bisect_right(self.ranges, seed, key=lambda part: part.start)
+        return before > 0 and seed in self.ranges[before - 1]
+
+    def __or__(self, other: "Seeds") -> "Seeds":
+        return _merged((*self.ranges, *other.ranges))
+
+
+def _range(text: str) -> range:
+    first, _, last = text.partition("..")
+    part = range(int(first), int(last or first) + 1)
+    if not part:
+        raise ValueError(f"{text} has no seeds")
+    return part
+
+
+def _merged(parts: Iterable[range]) -> Seeds:
+    """The numbers of these ranges, which may overlap."""
+    merged: list[range] = []
+    for part in sorted(parts, key=lambda part: part.start):
+        if merged and part.start <= merged[-1].stop:
+            merged[-1] = range(merged[-1].start, max(merged[-1].stop, part.stop))
+        else:
+            merged.append(part)
+    return Seeds(tuple(merged))
+
+
+def names_entry(names: Iterable[str]) -> dict[str, Any]:
+    """The entry of a card for names of rounds: their number, and the SHA-256 of the sorted names as
+    JSON. It identifies a set of rounds that someone else can list."""
+    ordered = sorted(names)
+    digest = hashlib.sha256(json.dumps(ordered).encode()).hexdigest()
+    return {"count": len(ordered), "sha256": digest}
+
+
+def shortened(about: Mapping[str, Any]) -> dict[str, Any]:
+    """A card's description of training data, or of the fit of the uncertainty head, without lists
+    of rounds. Raises ValueError, KeyError or TypeError for a damaged one."""
+    short = dict(about)
+    if "seeds" in about:
+        short["seeds"] = Seeds.read(about["seeds"]).entry()
+    if "held_out" in about:
+        short["held_out"] = _short_names(about["held_out"])
+    if "split" in about:
+        short["split"] = {side: _short_names(names) for side, names in about["split"].items()}
+    return short
+
+
+def _short_names(names: Mapping[str, Any] | Iterable[str]) -> dict[str, Any]:
+    return dict(names) if isinstance(names, Mapping) else names_entry(names)
