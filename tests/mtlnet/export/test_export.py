@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from mtlnet.inference.uncertainty import read_uncertainty_head
 from safetensors.numpy import load_file
 
 import mtlnet.export.convert
@@ -41,9 +42,8 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
-from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.network import Network, fold, load_network
-from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
+from mtlnet.model.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
 from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
 from tests.mtlnet.conftest import require_close
@@ -313,7 +313,7 @@ def test_a_published_graph_is_on_the_disk_before_it_has_its_name(
     def record(path: Path) -> None:
         synced.append((path.name, sorted(found.name for found in tmp_path.iterdir())))
 
-    monkeypatch.setattr("mtlnet.openvino_graph.fsync_path", record)
+    monkeypatch.setattr("mtlnet.model.openvino_graph.fsync_path", record)
     write_graph(fold(Network()), tmp_path / "model.xml", tmp_path / "model.bin")
     staged, named = ["staged.bin", "staged.xml"], ["model.bin", "model.xml"]
     assert sorted(synced[:2]) == [("staged.bin", staged), ("staged.xml", staged)]

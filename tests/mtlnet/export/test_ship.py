@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mtlnet.inference.weights_file import read_weights
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
@@ -19,8 +20,7 @@ from mtlnet.export.ship import half, ship_model, write_page
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, ModelError, read_card
-from mtlnet.inference.weights_file import read_weights
-from mtlnet.openvino_graph import TOLERANCE
+from mtlnet.model.openvino_graph import TOLERANCE
 from serve.scheduling.warmup import warm_up
 from tests.mtlnet.conftest import write_dataset
 from trackfeatures.camera import CameraParameters

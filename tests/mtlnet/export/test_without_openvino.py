@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mtlnet.inference.uncertainty import FittedUncertainty, read_uncertainty_head
 
 from benchmarks.gpu.publish_checkpoint import publish_checkpoint
 from datagen.recording import Dataset
@@ -19,9 +20,8 @@ from mtlnet.inference.engine import has_openvino, load_engine
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import CARD, UNCERTAINTY_WEIGHTS, WEIGHTS, read_card
 from mtlnet.inference.torch_engine import TorchEngine
-from mtlnet.inference.uncertainty import FittedUncertainty, read_uncertainty_head
 from mtlnet.model.network import fold, load_network, predict_images
-from mtlnet.openvino_graph import TOLERANCE
+from mtlnet.model.openvino_graph import TOLERANCE
 from mtlnet.training.checkpoint import save_checkpoint
 from mtlnet.training.recipes import find_recipe
 from mtlnet.training.run import create_run

@@ -21,7 +21,7 @@ from mtlnet.model.bins import (
     read_scores,
 )
 from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
-from mtlnet.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
+from mtlnet.model.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
 from mtlnet.training.losses.bins import bins_loss
 from mtlnet.training.losses.multi_task import Losses
 from mtlnet.training.losses.task_weighting import TaskWeighting

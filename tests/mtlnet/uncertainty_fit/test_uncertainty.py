@@ -6,12 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
-from datagen.recording import Dataset
-from mtlnet.evaluation.metrics import calibration, coverage
-from mtlnet.inference.engine import Precision, load_engine
-from mtlnet.inference.model_card import WEIGHTS, resolve_run
-from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.inference.uncertainty import (
     CELL_VALUES,
     FEATURES,
@@ -23,6 +17,12 @@ from mtlnet.inference.uncertainty import (
     standardise,
     texture_features,
 )
+
+from datagen.recording import Dataset
+from mtlnet.evaluation.metrics import calibration, coverage
+from mtlnet.inference.engine import Precision, load_engine
+from mtlnet.inference.model_card import WEIGHTS, resolve_run
+from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.model.network import load_network
 from mtlnet.uncertainty_fit.frame_outputs import FrameOutputs
 from mtlnet.uncertainty_fit.head import (
