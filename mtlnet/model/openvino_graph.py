@@ -2,10 +2,10 @@
 
 The graph is written beside the weights, so that `serve` loads it without torch.
 
-Every fully connected layer but the shared ones and the directions of the texture is computed in
-float32 even where the rest is in bf16: OpenVINO rounds the results of a MatMul to bf16, in steps of
-0.004 near 1, which is 0.025 m or 0.005 rad of a head with coded values. The directions stay in
-bf16: their result, a sum of squares, is then wrong by 0.1 %, at most 0.5 %.
+The heads, the uncertainty head and the textures are computed in float32 even where the rest is in
+bf16: OpenVINO rounds the results of a MatMul to bf16, in steps of
+0.004 near 1, which is 0.025 m or 0.005 rad of a head with coded values. The directions of
+the texture stay in bf16: their result, a sum of squares, is then wrong by 0.1 %, at most 0.5 %.
 """
 
 import errno
@@ -28,11 +28,8 @@ TOLERANCE = 2e-4
 float32."""
 UNCERTAINTY_TOLERANCE = 5e-3
 """Tolerance: largest relative difference of a standard deviation or the OOD score."""
-FLOAT32_LAYERS = ("network.heads.", "head.std.", "head.pitch.")
-"""Modules of `ServedNetwork` whose layers are computed in float32."""
-FLOAT32_MARK = "precise_0"
-"""OpenVINO's mark of an operation that keeps its precision (`DisableFP16Compression`); it is
-stored in the file of the graph."""
+DIRECTIONS = "__module.head/aten::linear/MatMul"
+"""Name of the product with `UncertaintyHead.texture_directions`."""
 MIN_NARROW_VALUES = 256  # smaller constants stay in float32
 
 
@@ -126,8 +123,30 @@ def _converted(module: nn.Module, batch: int) -> Any:
         )
     model.inputs[0].get_tensor().set_names({"images"})
     model.outputs[0].get_tensor().set_names({"outputs"})
-    layers = tuple(f"__module.{name}" for name in FLOAT32_LAYERS)
-    for operation in model.get_ordered_ops():
-        if operation.get_friendly_name().startswith(layers):
-            operation.get_rt_info()[FLOAT32_MARK] = ""
+    _keep_float32(model)
     return model
+
+
+def _keep_float32(model: Any) -> None:
+    """Replace the products of the heads and the uncertainty head by products and sums of numbers,
+    which OpenVINO leaves in float32 (in place)."""
+    products = [op for op in model.get_ordered_ops() if op.get_type_name() == "MatMul"]
+    for product in products:
+        name = product.get_friendly_name()
+        if ".shared." not in name and name != DIRECTIONS:
+            summed = _sum_of_products(*product.input_values())
+            summed.set_friendly_name(f"{name}/summed")
+            product.output(0).replace(summed.output(0))
+
+
+def _sum_of_products(x: Any, weight: Any) -> Any:
+    """Product (B, N) of x (B, F) and the transpose of weight (N, F)."""
+    from openvino import opset13 as ops
+
+    if x.get_partial_shape()[0].is_dynamic:
+        each = ops.multiply(ops.unsqueeze(x, np.array([1])), ops.unsqueeze(weight, np.array([0])))
+        # The sum must keep the axis: OpenVINO 2026.4 otherwise adds a following bias (1, N) to the
+        # wrong values.
+        return ops.squeeze(ops.reduce_sum(each, np.array([2]), keep_dims=True), np.array([2]))
+    # In two dimensions: OpenVINO would reorder three dimensions as the channels of an image.
+    return ops.unsqueeze(ops.reduce_sum(ops.multiply(x, weight), np.array([1])), np.array([0]))
