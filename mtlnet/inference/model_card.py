@@ -2,7 +2,7 @@
 
 The folder of a run contains `card.json`, `config.json`, `model.safetensors` (the weights, batch
 normalisation folded), `uncertainty.safetensors` (the uncertainty head), `model.xml` and `model.bin`
-(the OpenVINO graph), `curves.csv`, `checkpoints/` and `tensorboard/`.
+(the served graph, for OpenVINO), `curves.csv`, `checkpoints/` and `tensorboard/`.
 """
 
 import json
@@ -24,6 +24,8 @@ CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.x
 UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
 SHIPPED_FILES = {
     WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
+    GRAPH: "3110826108dd5c347849e2b3ff0f2ccdba7ea5cdecca810a9a5ae76f8b724daa",
+    GRAPH_WEIGHTS: "0d66ab6a6de074aa9c997773210649e1480622c0a135dfccd52bd020aa0378c9",
     UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
 }
 """SHA-256 of the shipped model's files."""

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mtlnet.inference.uncertainty import read_uncertainty_head
 from safetensors.numpy import load_file
 
 import mtlnet.export.convert
@@ -31,6 +30,7 @@ from mtlnet.inference.engine import (
     load_engine,
     openvino_core,
     read_graph,
+    run_graph,
     uses_int8,
 )
 from mtlnet.inference.model_card import (
@@ -42,8 +42,9 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
+from mtlnet.inference.torch_engine import convert_run, load_served
 from mtlnet.model.network import Network, fold, load_network
-from mtlnet.model.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
+from mtlnet.model.openvino_graph import TOLERANCE, build_graph, write_graph
 from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
 from tests.mtlnet.conftest import require_close
@@ -111,8 +112,8 @@ def test_an_openvino_model_answers_any_number_of_images_each_as_alone(
     """The shipped model, with its standard deviations and its score."""
     run = resolve_run("default")
     card = read_card(run)
-    network = load_network(run / WEIGHTS, card.network)
-    graph = build_graph(network, read_uncertainty_head(run), batch=-1)
+    served = load_served(run, card)
+    graph = build_graph(served.network, served.head, batch=-1)
     write_openvino(graph, tmp_path, precision)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     model = openvino_core().compile_model(str(tmp_path / GRAPH), "CPU", options)
@@ -153,9 +154,9 @@ def consumers(operation: Any) -> Any:
     return operation.output(0).get_target_inputs()
 
 
-def test_weights_that_stay_float_are_the_last_shared_layers_and_the_textures() -> None:
+def test_weights_that_stay_float_are_the_last_shared_layer_and_the_directions() -> None:
     run = resolve_run("default")
-    graph = read_graph(run, read_card(run))
+    graph = convert_run(run, read_card(run))
     products = operation_names(graph, "MatMul")
     sizes = {
         op.get_friendly_name(): list(op.get_output_shape(0))
