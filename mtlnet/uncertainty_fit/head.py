@@ -96,7 +96,9 @@ def fit_uncertainty_head(
     torch.set_num_threads(1)  # the head is small, and more threads are slower
 
     def standardised(x: NDArray[np.float32]) -> NDArray[np.float32]:
-        return standardise(*map(torch.from_numpy, (x, centre, scale)), count).numpy()
+        tensors = (torch.from_numpy(each) for each in (x, centre, scale))
+        found: NDArray[np.float32] = standardise(*tensors, count=count).numpy()
+        return found
 
     known_z = standardised(known.x)
     held_out_z = None if unseen is None else replace(unseen, x=standardised(unseen.x))

@@ -112,8 +112,8 @@ def test_an_openvino_model_answers_any_number_of_images_each_as_alone(
     """The shipped model, with its standard deviations and its score."""
     run = resolve_run("default")
     card = read_card(run)
-    served = load_served(run, card)
-    graph = build_graph(served.network, served.head, batch=-1)
+    module = load_served(run, card)
+    graph = build_graph(module.network, module.head, batch=-1)
     write_openvino(graph, tmp_path, precision)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     model = openvino_core().compile_model(str(tmp_path / GRAPH), "CPU", options)

@@ -1,7 +1,7 @@
 """The uncertainty head: standard deviations that match errors, and the OOD score."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -33,7 +33,7 @@ OOD_IMAGES = 1000
 ROOT = Path(__file__).parents[3]
 
 
-def textures_of(images: Sequence[np.ndarray]) -> np.ndarray:
+def textures_of(images: Iterable[np.ndarray]) -> np.ndarray:
     """Texture features (N, C + M) of images."""
     return np.stack([texture_features(torch.from_numpy(one[None]))[0].numpy() for one in images])
 
