@@ -24,8 +24,8 @@ CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.x
 UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
 SHIPPED_FILES = {
     WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
-    GRAPH: "3110826108dd5c347849e2b3ff0f2ccdba7ea5cdecca810a9a5ae76f8b724daa",
-    GRAPH_WEIGHTS: "0d66ab6a6de074aa9c997773210649e1480622c0a135dfccd52bd020aa0378c9",
+    GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
+    GRAPH_WEIGHTS: "c29fa70baad6ab421c4dcbd9d0dd9a25dfed741cf77b11d526ef2f08fbdd7208",
     UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
 }
 """SHA-256 of the shipped model's files."""
