@@ -143,6 +143,15 @@ def test_a_worker_that_dies_is_named_and_reset_starts_others(
     np.testing.assert_array_equal(two_cars.reset(seed=0)[0]["image"], before)
 
 
+def test_new_workers_draw_all_cars(two_cars: DriverViewVector) -> None:
+    before = two_cars.reset(seed=0)[0]["image"].copy()
+    two_cars._observer._pictures._pool._owner = -1  # as in a forked child
+    only_one = {"reset_mask": np.array([False, True])}
+    after = two_cars.reset(seed=5, options=only_one)[0]["image"]
+    assert not np.shares_memory(after, before)
+    np.testing.assert_array_equal(after[0], before[0])
+
+
 def test_a_worker_that_hangs_is_named(
     two_cars: DriverViewVector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
