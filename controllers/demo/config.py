@@ -35,5 +35,5 @@ class DemoConfig:
     drive_track: str = "highway"
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.minutes):  # `min` allows both NaN and infinity
+        if not math.isfinite(self.minutes):  # `min` allows infinity
             raise UserError(f"--minutes is {self.minutes}; give a finite number of 0.1 or more")
