@@ -118,7 +118,8 @@ def make_controller(
     module, _, function = entry.factory.partition(":")
     make: Callable[..., Controller] = getattr(importlib.import_module(module), function)
     try:
-        return make(loop, **given)
+        with np.errstate(all="ignore"):
+            return make(loop, **given)
     except (ValueError, np.linalg.LinAlgError) as error:
         limits = ", ".join(f"{each} {entry.tunable[each]}" for each in given)
         raise UserError(

@@ -1,10 +1,13 @@
 """The configuration of `controllers demo`: its options, their defaults, and its fixed settings."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from typer import Option
+
+from trackfeatures.errors import UserError
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,3 +33,7 @@ class DemoConfig:
     asked: int = 12
     """Held-out frames that are posted to the service."""
     drive_track: str = "highway"
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.minutes):  # `min` allows infinity
+            raise UserError(f"--minutes is {self.minutes}; give a finite number of 0.1 or more")

@@ -70,8 +70,10 @@ class DriveOptions:
             for value in ends_of(name, getattr(self, name)):
                 if not value > 0.0:
                     raise UserError(f"{name} is {value:g}; give a factor above 0")
-        ranged = isinstance(self.lanes, tuple)
-        for lanes in ends_of("lanes", self.lanes) if ranged else (self.lanes,):
+        numbers: Any = self.lanes if isinstance(self.lanes, tuple) else (self.lanes,)
+        if isinstance(self.lanes, tuple):
+            ends_of("lanes", self.lanes)
+        for lanes in numbers:
             tf.check_lanes(lanes, tf.LANE_WIDTH_M)
         if self.lane_width is not None:
             for width in ends_of("lane_width", self.lane_width):

@@ -47,6 +47,8 @@ PER_CAR = (
 CARS_PER_THREAD = 32
 """Least number of cars for which a thread of their own saves time."""
 MASK = "reset_mask"
+Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
+"""One seed, to which each car adds its number, or one for each car."""
 Options = TypeVar("Options", DriveOptions, RenderOptions)
 
 
@@ -139,7 +141,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: Seeds = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode of each car, or of those of `options["reset_mask"]` (N,) bool. The other
@@ -264,7 +266,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             raise ResetNeeded("the first reset must reset all cars; leave reset_mask out")
         return found
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+    def _seeds(self, seed: Seeds) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
         if not isinstance(seed, list | tuple | np.ndarray):

@@ -46,10 +46,10 @@ class VectorObserver:
             for number, own in enumerate(pictures)
         ]
         self._first = self._observers[0]
-        self.single_space: Any = self._first.space
+        self.single_space = self._first.space
         self.space = batch_space(self.single_space, count)
         self._readings = {
-            sensor.name: np.zeros((count, *self.single_space[sensor.name].shape), sensor.dtype)
+            sensor.name: np.zeros((count, *(sensor.shape or (1,))), sensor.dtype)
             for sensor in self._first.suite.sensors
         }
 

@@ -33,8 +33,12 @@ class VectorPictures:
     def draw(self, views: Sequence[str], chosen: Iterable[int]) -> None:
         """Draw the views of the current state of the cars `chosen` that are not drawn yet.
 
-        Raises PictureWorkerError when a worker dies; the next `draw` starts others.
+        Raises PictureWorkerError when a worker dies; the next `draw` starts others. New workers
+        draw all cars: their memory is empty.
         """
+        if not self._pool.running:
+            self.close()
+            chosen = range(len(self._options))
         due = [
             number
             for number in chosen

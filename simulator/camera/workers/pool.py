@@ -80,6 +80,11 @@ class PicturePool:
         """The views that have room in the shared memory."""
         return tuple(self._formats)
 
+    @property
+    def running(self) -> bool:
+        """Whether there are workers, of this process and not of one that it was forked from."""
+        return bool(self._workers) and self._owner == os.getpid()
+
     def number_of(self, scenery: Scenery) -> int:
         """The number of a scenery in a `Shot`; each scenery is sent to a worker once."""
         key = (id(scenery.road), scenery.light, scenery.light_seed)  # the list keeps the road alive
@@ -115,7 +120,7 @@ class PicturePool:
         self._workers, self._pictures = [], {}
 
     def _start(self) -> None:
-        if self._workers and self._owner == os.getpid():
+        if self.running:
             return
         self.close()  # in a forked child: the workers are the parent's
         descriptor = create_memory(self._cars, self._formats)

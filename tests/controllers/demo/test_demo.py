@@ -1,6 +1,7 @@
 """The demo: choice of frames, limit checks, child processes."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -180,3 +181,9 @@ def test_sigterm_also_ends_the_child_process(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         process.wait(120)
     assert (tmp_path / "stopped").exists()
+
+
+@pytest.mark.parametrize("minutes", [math.nan, math.inf])
+def test_a_training_time_that_is_not_finite_is_refused(minutes: float) -> None:
+    with pytest.raises(UserError, match=f"^--minutes is {minutes}; give a finite number"):
+        DemoConfig(minutes=minutes)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,7 +90,8 @@ def test_one_measurement_that_is_not_finite_does_not_stay_in_the_filter(
 ) -> None:
     good = Observation(0.3, 0.01, RoadClass.STRAIGHT, vx=15.0, vy=0.0, yaw_rate=0.0)
     steered = []
-    for bad in (good, replace(good, **{name: math.nan}), replace(good, **{name: -math.inf})):
+    changes: list[dict[str, Any]] = [{}, {name: math.nan}, {name: -math.inf}]
+    for bad in (replace(good, **change) for change in changes):
         law = make_controller(controller, LoopConfig(dt=0.05, noisy=True))
         steered.append([law.update(bad if k == 10 else good) for k in range(16)])
     assert max(map(abs, steered[0])) > 0.01

@@ -54,8 +54,14 @@ def two_cars() -> Iterator[DriverViewVector]:
     vector.close()
 
 
+EXTENDED = pytest.mark.extended
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize(
+    "mode",
+    [AutoresetMode.NEXT_STEP, pytest.param(AutoresetMode.SAME_STEP, marks=EXTENDED)],
+)
 def test_pictures_and_states_equal_single_environments(mode: AutoresetMode) -> None:
     shared: dict[str, Any] = {
         **SMALL,
@@ -106,6 +112,7 @@ def test_pictures_and_states_equal_single_environments(mode: AutoresetMode) -> N
     expected.close()
 
 
+@pytest.mark.slow
 def test_observations_view_the_shared_memory_only_without_copy(two_cars: DriverViewVector) -> None:
     first = two_cars.reset(seed=0, options={"speed": 10.0})[0]["image"]
     assert first.shape == (2, 32, 40, 3)
@@ -121,7 +128,8 @@ def test_observations_view_the_shared_memory_only_without_copy(two_cars: DriverV
     copying.close()
 
 
-@pytest.mark.parametrize("fate", [signal.SIGKILL, signal.SIGSEGV])
+@pytest.mark.slow
+@pytest.mark.parametrize("fate", [signal.SIGKILL, pytest.param(signal.SIGSEGV, marks=EXTENDED)])
 def test_a_worker_that_dies_is_named_and_reset_starts_others(
     two_cars: DriverViewVector, fate: signal.Signals
 ) -> None:
@@ -143,6 +151,17 @@ def test_a_worker_that_dies_is_named_and_reset_starts_others(
     np.testing.assert_array_equal(two_cars.reset(seed=0)[0]["image"], before)
 
 
+@pytest.mark.extended
+def test_new_workers_draw_all_cars(two_cars: DriverViewVector) -> None:
+    before = two_cars.reset(seed=0)[0]["image"].copy()
+    two_cars._observer._pictures._pool._owner = -1  # as in a forked child
+    only_one = {"reset_mask": np.array([False, True])}
+    after = two_cars.reset(seed=5, options=only_one)[0]["image"]
+    assert not np.shares_memory(after, before)
+    np.testing.assert_array_equal(after[0], before[0])
+
+
+@pytest.mark.extended
 def test_a_worker_that_hangs_is_named(
     two_cars: DriverViewVector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,6 +172,7 @@ def test_a_worker_that_hangs_is_named(
         two_cars.step(np.zeros((2, 1), np.float32))
 
 
+@pytest.mark.slow
 def test_workers_and_memory_are_gone_after_close_and_garbage_collection() -> None:
     before = shared_memories()
     for end in ("close", "drop"):
@@ -182,7 +202,7 @@ while True:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fate", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("fate", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=EXTENDED)])
 def test_workers_end_with_their_process(fate: signal.Signals, tmp_path: Path) -> None:
     """The script has no `if __name__ == "__main__"`: workers do not import it."""
     script = tmp_path / "script.py"
