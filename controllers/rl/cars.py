@@ -199,7 +199,8 @@ def random_cars(
         RANDOM if several and number % 2 else tracks[pair % len(tracks)]
         for number, pair in enumerate(pairs.tolist())
     ]
-    turns = pairs * GOLDEN_RATIO % 1.0 < disturbed
+    ranks = np.argsort(np.argsort(np.unique(pairs) * GOLDEN_RATIO % 1.0))
+    disturbs = (ranks < disturbed * len(ranks))[pairs]
     folder = options.get("tracks_dir")
     lengths = {name: find_track(name, folder).length_m for name in set(chosen) - {RANDOM}}
     standing = np.random.default_rng(count).random(count) < STANDING
@@ -207,4 +208,4 @@ def random_cars(
         "s": [(0.0, lengths.get(name, RANDOM_START_M)) for name in chosen],
         "speed": [0.0 if still else START_SPEED for still in standing.tolist()],
     }
-    return Cars(definition, chosen, turns, starts=starts, episode=EPISODE_STEPS, **options)
+    return Cars(definition, chosen, disturbs, starts=starts, episode=EPISODE_STEPS, **options)
