@@ -144,7 +144,12 @@ def test_a_cut_episode_continues_with_the_value_of_its_last_state() -> None:
 
 
 def test_the_rates_fall_linearly() -> None:
-    ppo = Ppo(replace(PpoSettings(), horizon=1, actor_rate=1e-3, critic_rate=4e-3), PAPER, 8, 0)
+    ppo = Ppo(
+        replace(PpoSettings(), horizon=1, minibatches=1, actor_rate=1e-3, critic_rate=4e-3),
+        PAPER,
+        8,
+        0,
+    )
     states = RNG.normal(size=(8, 7)).astype(np.float32)
     step = step_of(states, RNG.normal(size=8), np.zeros(8, np.bool_))
     ppo.learn(states, RNG.normal(size=8).astype(np.float32), step, RNG, 0.25)
