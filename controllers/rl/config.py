@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Option
 
@@ -194,7 +194,7 @@ class TrainConfig:
 def resolve(config: TrainConfig) -> TrainConfig:
     """`config` with the defaults that depend on other options."""
     many = config.vectorised
-    defaults = {
+    defaults: dict[str, Any] = {
         "envs": 256 if many else 1,
         "track": ALL_TRACKS if many else "forza",
         "steps": 20_000_000 if many else 400_000,

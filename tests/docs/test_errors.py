@@ -17,6 +17,9 @@ import pytest
 import simplejpeg
 
 import simulator.env  # noqa: F401  # registers the environments
+from controllers.rl.config import TrainConfig
+from controllers.rl.run_folder import stored_config
+from controllers.rl.training import train as train_actor
 from datagen.recording import Dataset
 from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.index import open_round
@@ -232,6 +235,10 @@ TRIES: dict[str, Try] = {
     "rounds without the drives": lambda folder: drive_rows(
         Dataset.open(write_dataset(folder)).select(), folder
     ),
+    "many cars with a state": lambda folder: train_actor(
+        TrainConfig(folder / "run", "td3", envs=8, state="residual")
+    ),
+    "a folder to continue": stored_config,
     "weights of the loss": lambda folder: parse_alpha("0.3,-1,0.5"),
 }
 """What makes the program refuse, by the first words of the row."""
