@@ -7,6 +7,9 @@ standard deviation that does not depend on the state. Advantages are generalised
 - The hidden layers have ReLU, and the mean action is odd: half the difference between tanh of the
   network's outputs for the state and for its mirror image. So the actor's files are those of `td3`.
 - An episode that is cut by its number of steps continues with the value of its last state.
+- Advantages are divided by their mean distance from their mean, not by their standard deviation,
+  and limited to 4 times it: an end costs hundreds of times as much as a usual step, and would hide
+  all others.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
   there is no bonus for entropy.
 - Rewards and states are scaled by constants instead of running means.
@@ -29,6 +32,7 @@ from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import PpoSettings
 
 ADAM_EPSILON = 1e-5
+ADVANTAGE_LIMIT = 4.0
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -54,6 +58,12 @@ def advantages_of(
         following = errors[t] + discount * gae_lambda * ~over[t] * following
         found[t] = following
     return found
+
+
+def scaled(advantages: Tensor) -> Tensor:
+    """`advantages` (B,) over their mean distance from their mean, limited to ADVANTAGE_LIMIT."""
+    centred = advantages - advantages.mean()
+    return (centred / (centred.abs().mean() + 1e-8)).clamp(-ADVANTAGE_LIMIT, ADVANTAGE_LIMIT)
 
 
 def clipped_loss(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
@@ -232,9 +242,8 @@ class Ppo:
         """One step on a minibatch; returns the losses and the mean divergence from the policy
         before the update."""
         of, policy = self.settings, self.policy
-        gained = (gained - gained.mean()) / (gained.std() + 1e-8)
         log_ratio = log_density(actions, policy.mean(states), policy.log_std) - before
-        actor = clipped_loss(log_ratio, gained, of.clip)
+        actor = clipped_loss(log_ratio, scaled(gained), of.clip)
         critic = 0.5 * ((policy.value(states) - returns) ** 2).mean()
         self._adam.zero_grad(set_to_none=True)
         (actor + critic).backward()

@@ -13,7 +13,7 @@ from controllers.rl.config import PpoSettings
 
 torch = pytest.importorskip("torch")
 
-from controllers.rl.ppo import Ppo, advantages_of, clipped_loss, log_density  # noqa: E402
+from controllers.rl.ppo import Ppo, advantages_of, clipped_loss, log_density, scaled  # noqa: E402
 
 RNG = np.random.default_rng(3)
 NOTHING = np.zeros((4, 1), np.bool_)
@@ -65,6 +65,15 @@ def test_the_loss_is_clipped_on_the_side_that_would_gain() -> None:
     loss.backward()
     assert loss.item() == pytest.approx(-(2.4 - 3.0 + 1.0 - 1.6 + 1.1) / 5)
     assert log_ratio.grad.tolist() == pytest.approx([0.0, 3.0 / 5, -1.0 / 5, 0.0, -1.1 / 5])
+
+
+def test_one_large_advantage_does_not_hide_the_others() -> None:
+    """0, 2 and 4 are at most 2 from their mean; their mean distance is 4 / 3."""
+    assert scaled(torch.tensor([0.0, 2.0, 4.0])).tolist() == pytest.approx([-1.5, 0.0, 1.5])
+    usual = [0.1, -0.1] * 50
+    found = scaled(torch.tensor([*usual, -30.0]))
+    assert found[-1].item() == -4.0
+    assert (found[0] - found[1]).item() == pytest.approx(0.2 / 0.5882, rel=0.02)
 
 
 def test_the_density_is_that_of_the_normal_distribution() -> None:
