@@ -117,7 +117,8 @@ class Cars:
         observed, rewards, ended, _, info = self._envs.step(self._actions)
         offsets, none = info["to_middle"], np.zeros(self.count, np.bool_)
         if self._quadratic:
-            running: Any = quadratic_reward(offsets, info["angle"], self._actions[:, 0], False)
+            steers: Any = self._actions[:, 0]  # the formula takes arrays, too
+            running = quadratic_reward(offsets, info["angle"], steers, False)
             rewards = np.where(ended, OFF_TRACK_REWARD, running)
         last = states = self._perceive(observed, info, none)
         self._left -= 1

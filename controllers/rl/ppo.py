@@ -246,7 +246,7 @@ class Ppo:
         actor = clipped_loss(log_ratio, scaled(gained), of.clip)
         critic = 0.5 * ((policy.value(states) - returns) ** 2).mean()
         self._adam.zero_grad(set_to_none=True)
-        (actor + critic).backward()
+        (actor + critic).backward()  # type: ignore[no-untyped-call]
         for part in (self._actor, self._critic):
             nn.utils.clip_grad_norm_(part, of.max_gradient)
         self._adam.step()

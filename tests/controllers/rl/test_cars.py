@@ -21,7 +21,11 @@ START = {"s": 300.0, "to_middle": -1.0, "angle": 0.05, "speed": 12.0}
 
 def oval(count: int, disturbed: bool = False, **changes: Any) -> Cars:
     """`count` cars on the oval, from one start."""
-    given = {"starts": START, "episode": (100, 100), "half_width_m": HALF_WIDTH_M} | changes
+    given: dict[str, Any] = {
+        "starts": START,
+        "episode": (100, 100),
+        "half_width_m": HALF_WIDTH_M,
+    } | changes
     definition: StateDefinition = given.pop("definition", PAPER)
     return Cars(definition, ["oval"] * count, np.full(count, disturbed), **given)
 
