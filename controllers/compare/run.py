@@ -16,7 +16,7 @@ from controllers.compare.config import CompareConfig
 from controllers.compare.curves import CurveRecorder
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
-from controllers.drive.run import drive, read_parameters
+from controllers.drive.run import GRID_SHARE, drive, read_parameters
 from controllers.interface import LoopConfig
 from controllers.laws.actor import WEIGHTS, is_actor
 from controllers.perception.sources import ServiceModel, check_perception
@@ -30,8 +30,6 @@ from trackfeatures.errors import UserError
 VERSION = 3
 """Version of `results.json`."""
 RESULTS, REPORT = "results.json", "report.html"
-GRID_SHARE = 1.0 / 6.0
-"""TORCS's first place on the grid: distance to the right of the centre over the track's width."""
 SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
 """Settings that are equal for all drives of a file."""
 

@@ -7,11 +7,14 @@ the road can be inferred from them; the paper's state does not contain it. LQR a
 rate.
 `residual`: `stacked` and the steering of the controller `lqr`. 0.3 times the actor's action is
 added to that steering (Johannink et al. 2019, residual reinforcement learning).
+`history`: the paper's state of the last eight steps: that of the present step, and those of the
+seven steps before as differences from it. Noise, delay and the car's motion can be inferred.
 
 Every drive divides the lateral offset by half the width of the track of the training: a controller
 does not know the width of the road, and its gains are per metre.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,7 +74,27 @@ RESIDUAL = StateDefinition(
     odd=(*STACKED.odd, -1.0),
     order=tuple(range(11)),
 )
-STATES = {state.name: state for state in (PAPER, STACKED, RESIDUAL)}
+HISTORY_STEPS = 8
+_CHANGE = (0.01, 0.005, 0.01, 0.01)
+"""Typical changes of the first four numbers of the paper's state in a step."""
+HISTORY = StateDefinition(
+    name="history",
+    parts=(
+        *PAPER.parts,
+        *(f"{part}_{back}" for back in range(1, HISTORY_STEPS) for part in PAPER.parts),
+    ),
+    spread=(
+        *PAPER.spread,
+        *(
+            spread
+            for back in range(1, HISTORY_STEPS)
+            for spread in (*(back * change for change in _CHANGE), 1.0, 1.0, 1.0)
+        ),
+    ),
+    odd=PAPER.odd * HISTORY_STEPS,
+    order=tuple(PAPER.size * back + k for back in range(HISTORY_STEPS) for k in PAPER.order),
+)
+STATES = {state.name: state for state in (PAPER, STACKED, RESIDUAL, HISTORY)}
 
 
 def find_state(name: str) -> StateDefinition:
@@ -88,11 +111,21 @@ def paper_state(seen: Observation, half_width: float) -> Vector:
     ).astype(np.float32)
 
 
+def history_state(recent: Vector) -> Vector:
+    """The state `history` (..., 56) from the paper's states (..., 8, 7), the newest first."""
+    now, before = recent[..., :1, :], recent[..., 1:, :]
+    whole: Vector = np.concatenate((now, before - now), axis=-2)
+    return whole.reshape(*recent.shape[:-2], HISTORY.size)
+
+
 class StateBuilder:
     """Builds the state of each step of one drive; it keeps what later states need of this step."""
 
     def __init__(self, definition: StateDefinition, loop: LoopConfig = EXACT) -> None:
         self._plain = definition.name == PAPER.name
+        self._recent: deque[Vector] | None = None
+        if definition.name == HISTORY.name:
+            self._recent = deque(maxlen=HISTORY_STEPS)
         self._lqr: Controller | None = None
         if definition.name == RESIDUAL.name:
             from controllers.laws.lqr import (
@@ -109,6 +142,10 @@ class StateBuilder:
         """The state from the paper's state (7,) and the observation of the same step."""
         if self._plain:
             return paper
+        if self._recent is not None:
+            missing = 1 if self._recent else HISTORY_STEPS  # the first state fills the past
+            self._recent.extendleft([paper] * missing)
+            return history_state(np.array(self._recent))
         d, angle, v_x, v_y, left, _, right = paper.tolist()
         d_before, angle_before = self._before or (d, angle)
         self._before = (d, angle)

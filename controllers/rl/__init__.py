@@ -1,4 +1,4 @@
-"""Training of an actor by reinforcement learning: the paper's DDPG, and TD3 as a stronger baseline.
+"""Training of an actor by reinforcement learning: the paper's DDPG, TD3, and PPO with many cars.
 
 `ddpg` follows the paper in its state, reward, ends of an episode, exploration (Gaussian noise of
 0.05 beta on an action, with a probability that falls from 1 to 0.1 over 4*10^5 steps), noise of
@@ -23,7 +23,12 @@ policy is the same), times 4. The inputs of its networks are divided by their ty
 and right are exchanged in half of the transitions, and the actor is odd by construction. Its
 episodes have 400 steps and begin at random places and motions.
 
+`ppo` (`controllers.rl.ppo`) always drives many cars, on all tracks and random roads. `ddpg` and
+`td3` may, too (`--envs 256`): the agent and its updates are the same, with 256 transitions for each
+update and one update for eight steps of all cars together.
+
 The paper's state contains neither the curvature of the road nor the yaw rate. `--state stacked`
 adds the yaw rate, the changes since the last step and the last two actions. `--state residual` also
-adds the steering of the controller `lqr`, which the actor's action corrects.
+adds the steering of the controller `lqr`, which the actor's action corrects. `--state history` has
+the paper's state of the last eight steps.
 """

@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from controllers.laws.actor import mirror_of
 from controllers.laws.actor_state import StateDefinition
+from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import Algorithm
-from controllers.rl.networks import Array, Shape, forward
+from controllers.rl.networks import Array, Shape, forward, layers
 from controllers.rl.updates import Batch, Trained, actor_update, critic_update
 
 TARGET_NOISE_CUT = 2.5  # standard deviations; TD3 clips noise of 0.2 at 0.5
@@ -92,6 +93,53 @@ class Agent:
         if ended:
             value -= of.reward_baseline * of.discount / (1.0 - of.discount)
         self.replay.add(seen, action, of.reward_scale * value, next_seen, ended)
+
+    def act_all(self, seen: Array) -> Array:
+        """The actions (N,) of the present actor for inputs of the networks (N, size)."""
+        rows = seen
+        if self.algorithm.mirrored:
+            rows = np.concatenate((seen, seen[:, self._order] * self._signs))
+        actions: Array = np.tanh(forward(self.actor.layers, rows).out[0])
+        return (
+            0.5 * (actions[: len(seen)] - actions[len(seen) :])
+            if len(rows) > len(seen)
+            else actions
+        )
+
+    def weights(self) -> dict[str, Array]:
+        """The arrays of the target actor as in an actor's file.
+
+        It is an average over the last updates, which steers more smoothly.
+        """
+        of = layers(self.actor.target.copy(), self.shape)
+        flat = {name: array[0] for name, array in of._asdict().items()}
+        return flat | {name: flat[name].reshape(-1) for name in ("b1", "b2", "w3", "b3")}
+
+    def store(self) -> tuple[Tensors, dict[str, int]]:
+        """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
+        filled = {name: array[: len(self.replay)] for name, array in self._replayed().items()}
+        counts = {"updates": self.updates, "added": self.replay.added}
+        return self._parameters() | filled, counts
+
+    def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
+        """Continue from the arrays and counts of a checkpoint."""
+        for name, array in self._parameters().items():
+            array[:] = tensors[name]
+        for name, array in self._replayed().items():
+            array[: len(tensors[name])] = tensors[name]
+        self.updates, self.replay.added = counts["updates"], counts["added"]
+
+    def _parameters(self) -> Tensors:
+        """Parameters and Adam's moments by name; they are not copied."""
+        return {
+            f"{name}.{part}": getattr(networks, part)
+            for name, networks in (("actor", self.actor), ("critics", self.critics))
+            for part in ("theta", "target", "moments")
+        }
+
+    def _replayed(self) -> Tensors:
+        names = ("states", "next_states", "results")
+        return {f"replay.{name}": getattr(self.replay, name) for name in names}
 
     def update(self, rng: np.random.Generator, rate_share: float) -> float:
         """One update on a random mini-batch; returns the critics' loss.

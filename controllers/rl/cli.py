@@ -1,21 +1,26 @@
 """The command `controllers train`. Run: `controllers train --algorithm td3 --track forza`."""
 
+from dataclasses import fields, replace
+from typing import Annotated, get_origin
+
 from controllers.cli_options import options
-from controllers.rl.config import TrainConfig
+from controllers.rl.config import TrainConfig, resolve
 from runtime import cli as command
+from trackfeatures.errors import UserError
 
 
 @options(TrainConfig)
 def train(config: TrainConfig, as_json: bool) -> None:
     """Train an actor to steer by reinforcement learning; drive it with `--controller OUT`.
 
-    Every --evaluate-every steps the present actor drives the track without noise, and the best
-    actor is kept. The same command continues an interrupted training.
+    At each evaluation the present actor drives without noise, and the best actor is kept. The same
+    command, or --resume, continues an interrupted training.
     """
     from rich.markup import escape
 
     from controllers.rl.training import train as run
 
+    config = _continued(config) if config.resume else resolve(config)
     name = escape(f"{config.algorithm} on {config.track}")
     with command.progress_bar() as bar:
         task = bar.add_task(name, total=config.steps)
@@ -31,3 +36,22 @@ def train(config: TrainConfig, as_json: bool) -> None:
         f"controllers drive --controller {config.out}"
     )
     command.print_result(result, as_json, line)
+
+
+def _continued(given: TrainConfig) -> TrainConfig:
+    """The options stored in the folder of the training `given`, with its number of threads.
+
+    Raises UserError if other options are given that differ from the stored ones.
+    """
+    from controllers.rl.run_folder import UNCOMPARED, stored_config
+
+    stored, default = stored_config(given.out), TrainConfig()
+    for field in fields(TrainConfig):
+        name, value = field.name, getattr(given, field.name)
+        declared = get_origin(field.type) is Annotated and name not in UNCOMPARED
+        if declared and value not in (getattr(default, name), getattr(stored, name)):
+            raise UserError(
+                f"{given.out} was started with {name} {getattr(stored, name)}, now {value} is "
+                "given; leave it out to continue, or start another training with another --out"
+            )
+    return replace(stored, threads=given.threads)

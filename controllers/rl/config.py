@@ -1,8 +1,9 @@
 """The configuration of `controllers train`, and the settings of each algorithm."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Option
 
@@ -82,23 +83,80 @@ ALGORITHMS = {
 }
 
 
+@dataclass(frozen=True)
+class PpoSettings:
+    """The settings of `ppo`; names without a comment are those of Schulman et al. 2017."""
+
+    discount: float = 0.97
+    gae_lambda: float = 0.95
+    horizon: int = 64
+    """Steps of each car between two updates."""
+    epochs: int = 4
+    minibatches: int = 8
+    clip: float = 0.2
+    actor_rate: float = 1e-3
+    critic_rate: float = 1e-3
+    rate_end: float = 0.0
+    """Share of the learning rates that is left at the last step; they fall linearly."""
+    max_gradient: float = 0.5
+    """Largest norm of the gradient, of the actor and of the critic."""
+    first_std: float = 0.14
+    """Standard deviation of the first steering actions; it is learned."""
+    state_noise: float = 0.0
+    """Standard deviation of the noise on the paper's state."""
+    reward_baseline: float = 1.0
+    reward_scale: float = 1.0
+    hidden: tuple[int, int] = (64, 64)
+
+
+PPO = "ppo"
+SETTINGS: dict[str, Algorithm | PpoSettings] = {**ALGORITHMS, PPO: PpoSettings()}
+
+
 def _defaults(name: str) -> str:
     """The value of a setting for each algorithm, for the help of an option."""
-    return ", ".join(f"{key} {getattr(one, name):g}" for key, one in ALGORITHMS.items())
+    return ", ".join(f"{key} {getattr(one, name):g}" for key, one in SETTINGS.items())
+
+
+ALL_TRACKS = "all"
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """One training. Equal configurations give equal actors, bit for bit."""
 
-    out: Annotated[Path, "Folder for the actor, its curve and its checkpoint."] = Path("runs/rl")
-    algorithm: Annotated[str, f"Algorithm: {' or '.join(ALGORITHMS)}."] = "ddpg"
-    track: options.Track = "forza"
+    out: Annotated[Path, "Folder for the actor, its curves and its checkpoint."] = Path("runs/rl")
+    algorithm: Annotated[str, f"Algorithm: {', '.join(ALGORITHMS)} or {PPO}."] = "ddpg"
+    envs: Annotated[
+        int | None,
+        Option(help="Cars that drive at once. Default: 256 with ppo, otherwise 1.", min=1),
+    ] = None
+    track: Annotated[
+        str | None,
+        "Name of a track (`simulator tracks`), or its file; with several cars also all: half of "
+        "the cars on all tracks, half on random roads. Default: forza with one car, otherwise all.",
+    ] = None
     seed: Annotated[int, Option(help="Seed of all random numbers of the training.", min=0)] = 0
     steps: Annotated[
-        int, Option(help="Control steps of 50 ms, with one update after each.", min=1)
-    ] = 400_000
-    state: Annotated[str, "State that the actor receives: paper, stacked or residual."] = "paper"
+        int | None,
+        Option(
+            help="Control steps of 50 ms of all cars together. Default: 400,000 with one car, "
+            "otherwise 20,000,000.",
+            min=1,
+        ),
+    ] = None
+    state: Annotated[str, "State that the actor receives: paper, history, stacked or residual."] = (
+        "paper"
+    )
+    disturbed: Annotated[
+        float,
+        Option(
+            help="Share of several cars with another friction, mass and throttle in each episode, "
+            "and with noise and delay of their state.",
+            min=0.0,
+            max=1.0,
+        ),
+    ] = 0.5
     state_noise: Annotated[
         float | None,
         "Standard deviation of the noise on the paper's state. Default: "
@@ -112,16 +170,59 @@ class TrainConfig:
     ] = None
     reward: options.Reward = "paper"
     evaluate_every: Annotated[
-        int, Option(help="Steps between two drives; a checkpoint is written after each.", min=1)
-    ] = 20_000
+        int | None,
+        Option(
+            help="Steps between two evaluations; a checkpoint is written after each. Default: "
+            "20,000 with one car, otherwise 500,000.",
+            min=1,
+        ),
+    ] = None
+    threads: Annotated[
+        int, Option(help="Threads of the vector environment and of torch.", min=1)
+    ] = 2
     tracks_dir: options.TracksDir = None
+    resume: Annotated[
+        bool, Option("--resume", help="Continue the training in --out with its own options.")
+    ] = False
+
+    @property
+    def vectorised(self) -> bool:
+        """Whether the cars are those of a vector environment."""
+        return self.algorithm == PPO or (self.envs or 1) > 1
 
 
-def find_algorithm(name: str) -> Algorithm:
-    """The settings of the algorithm `name`. Raises UserError for an unknown name."""
-    if name not in ALGORITHMS:
-        raise UserError(f"there is no algorithm {name!r}; use one of: {', '.join(ALGORITHMS)}")
-    return ALGORITHMS[name]
+def resolve(config: TrainConfig) -> TrainConfig:
+    """`config` with the defaults that depend on other options."""
+    many = config.vectorised
+    defaults: dict[str, Any] = {
+        "envs": 256 if many else 1,
+        "track": ALL_TRACKS if many else "forza",
+        "steps": 20_000_000 if many else 400_000,
+        "evaluate_every": 500_000 if many else 20_000,
+    }
+    missing = {name: value for name, value in defaults.items() if getattr(config, name) is None}
+    return replace(config, **missing)
+
+
+def find_settings(config: TrainConfig) -> Algorithm | PpoSettings:
+    """The settings of the algorithm, with the changes of `config`.
+
+    Raises UserError for an unknown algorithm and for a learning rate out of range.
+    """
+    if config.algorithm not in SETTINGS:
+        raise UserError(
+            f"there is no algorithm {config.algorithm!r}; use one of: {', '.join(SETTINGS)}"
+        )
+    settings = SETTINGS[config.algorithm]
+    if config.reward == "quadratic":
+        scale = QUADRATIC_SCALE * settings.reward_scale
+        settings = replace(settings, reward_baseline=0.0, reward_scale=scale)
+    given = {name: getattr(config, name) for name in ("state_noise", "actor_rate", "critic_rate")}
+    settings = replace(settings, **{n: value for n, value in given.items() if value is not None})
+    for rate in (settings.actor_rate, settings.critic_rate):
+        if not 0.0 < rate < math.inf:
+            raise UserError(f"the learning rate {rate} is out of range; give one above 0")
+    return settings
 
 
 def exploration_share(step: int) -> float:

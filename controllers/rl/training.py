@@ -1,16 +1,13 @@
-"""Training of an actor in the Gymnasium environment; drives choose the best actor. SI units.
+"""Training of an actor with one car; drives choose the best actor. SI units.
 
 controllers train --algorithm td3 --track forza --seed 0 --out runs/rl
 
 The random numbers of an episode depend only on the seed and the episode's number, and checkpoints
 are written between episodes. So a resumed training gives the same actor as an uninterrupted one.
+Trainings with many cars are in `vector_training`.
 """
 
-import json
-import math
-import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
 from typing import Any
 
 import gymnasium as gym
@@ -20,22 +17,22 @@ import simulator.env  # noqa: F401 registers the environment
 from controllers.drive.closed_loop import DriveResult, check_reward, run_lap
 from controllers.drive.run import FREQUENCY_HZ, steps_for
 from controllers.interface import Observation
-from controllers.laws.actor import Actor, ActorCard, save_actor
+from controllers.laws.actor import Actor, ActorCard
 from controllers.laws.actor_state import StateBuilder, find_state
 from controllers.laws.rl import RlController
 from controllers.perception.sources import truth
 from controllers.rl.agent import Agent
-from controllers.rl.checkpoint import Progress, load_checkpoint, save_checkpoint
 from controllers.rl.config import (
+    ALL_TRACKS,
     EXPLORATION_NOISE,
-    QUADRATIC_SCALE,
     Algorithm,
     TrainConfig,
     exploration_share,
-    find_algorithm,
+    find_settings,
+    resolve,
 )
-from controllers.rl.networks import layers
-from runtime.files import atomic_write, locked_folder, write_json
+from controllers.rl.run_folder import RunFolder, prepare_folder
+from runtime.files import locked_folder
 from simulator.env.reward import quadratic_reward
 from simulator.track.road import Road
 from simulator.world.world import World
@@ -45,8 +42,6 @@ PAPER_EPISODE_STEPS, RANDOM_EPISODE_STEPS = 6500, 400
 """Steps of an episode from the paper's start, and with `random_starts`."""
 PAPER_STARTS = 0.1
 """Share of the episodes that begin at the paper's start with `random_starts`."""
-CONFIG, CURVE = "config.json", "curve.csv"
-COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 
 Report = Callable[[int, float], None]
 """A function that is called with the number of finished steps and the best score per step so far,
@@ -56,58 +51,30 @@ which is -inf before the first drive."""
 def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
     """Train as `config` describes, from the checkpoint of the run if it has one.
 
-    Writes the best actor (by the drives on the training track), `curve.csv` and `config.json` into
-    `config.out`. Raises UserError for an unknown name, or a run of another configuration.
+    Writes the best actor (by the evaluations), its curves and `config.json` into `config.out`.
+    Raises UserError for an unknown name, or a run of another configuration.
     """
-    algorithm = _settings(config)
+    config = resolve(config)
+    check_reward(config.reward)
+    settings = find_settings(config)
     find_state(config.state)
-    options: dict[str, Any] = {"noise": algorithm.state_noise, "tracks_dir": config.tracks_dir}
+    if config.vectorised:
+        from controllers.rl.vector_training import train_vector
+
+        return train_vector(config, settings, report)
+    assert isinstance(settings, Algorithm)
+    if config.track == ALL_TRACKS:
+        raise UserError("--track all needs several cars; give --envs, for example 256")
+    options: dict[str, Any] = {"noise": settings.state_noise, "tracks_dir": config.tracks_dir}
     env = gym.make(
         "driverview/LateralControl-v0", track=config.track, disable_env_checker=True, **options
     )
     try:
-        _prepare_folder(config)
+        prepare_folder(config)
         with locked_folder(config.out):
-            return _Training(config, algorithm, env, report).run()
+            return _Training(config, settings, env, report).run()
     finally:
         env.close()
-
-
-def _settings(config: TrainConfig) -> Algorithm:
-    """The settings of the algorithm, with the changes of `config`."""
-    check_reward(config.reward)
-    algorithm = find_algorithm(config.algorithm)
-    if config.reward == "quadratic":
-        scale = QUADRATIC_SCALE * algorithm.reward_scale
-        algorithm = replace(algorithm, reward_baseline=0.0, reward_scale=scale)
-    given = {name: getattr(config, name) for name in ("state_noise", "actor_rate", "critic_rate")}
-    algorithm = replace(algorithm, **{n: value for n, value in given.items() if value is not None})
-    for rate in (algorithm.actor_rate, algorithm.critic_rate):
-        if not 0.0 < rate < math.inf:
-            raise UserError(f"the learning rate {rate} is out of range; give one above 0")
-    return algorithm
-
-
-def _prepare_folder(config: TrainConfig) -> None:
-    """Make the folder of the run, or check that it contains a run of the same configuration."""
-    path = config.out / CONFIG
-    content = json.loads(json.dumps(asdict(config), default=str))
-    if path.exists():
-        try:
-            found = dict(json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
-            raise UserError(f"{path} cannot be read ({error}); give another --out") from error
-        found = asdict(TrainConfig()) | found  # runs made before `reward` existed lack it
-        # `out` is not compared, because the folder may have been moved.
-        changed = [n for n in content if n != "out" and found.get(n) != content[n]]
-        if changed:
-            raise UserError(
-                f"{config.out} holds a training with another {', '.join(changed)}; give another "
-                "--out, or the same options to continue it"
-            )
-        return
-    config.out.mkdir(parents=True, exist_ok=True)
-    write_json(path, content)
 
 
 class _Training:
@@ -121,28 +88,24 @@ class _Training:
         report: Report | None,
     ) -> None:
         self._config, self._algorithm, self._env, self._report = config, algorithm, env, report
+        assert config.steps is not None
+        assert config.evaluate_every is not None
+        self._steps, self._evaluate_every = config.steps, config.evaluate_every
         self._state = find_state(config.state)
         self._agent = Agent(algorithm, self._state, config.seed)
-        self._progress = load_checkpoint(config.out, self._agent) or Progress()
+        self._folder = RunFolder(config.out, self._agent)
+        self._progress = self._folder.progress
         self._world: World = env.unwrapped.world  # type: ignore[attr-defined]
-        self._started = time.monotonic() - self._progress.seconds
 
     def run(self) -> dict[str, Any]:
-        progress, config = self._progress, self._config
-        while progress.step < config.steps:
-            self._episode()
-            last = progress.step >= config.steps
-            if last or progress.step - progress.evaluated >= config.evaluate_every:
-                self._evaluate()
-                save_checkpoint(config.out, self._agent, progress)
-        return {
-            "out": str(config.out),
-            "steps": progress.step,
-            "episodes": progress.episode,
-            "seconds": round(progress.seconds, 1),
-            "best_step": progress.best_step,
-            "best_score_per_step": progress.best_score,
-        }
+        progress = self._progress
+        with self._folder:
+            while progress.step < self._steps:
+                self._episode()
+                last = progress.step >= self._steps
+                if last or progress.step - progress.evaluated >= self._evaluate_every:
+                    self._evaluate()
+        return self._folder.result()
 
     def _episode(self) -> None:
         """One episode; each step is followed by an update once the replay has `learning_starts`
@@ -154,7 +117,7 @@ class _Training:
         seen = agent.see(states.build(paper, self._observe()))
         limit = RANDOM_EPISODE_STEPS if algorithm.random_starts else PAPER_EPISODE_STEPS
         losses: list[float] = []
-        for _ in range(min(limit, self._config.steps - progress.step)):
+        for _ in range(min(limit, self._steps - progress.step)):
             action = self._explore(agent.act(seen), rng)
             steer = np.array([states.steer(action)], np.float32)
             paper, reward, ended, _, _ = self._env.step(steer)
@@ -173,7 +136,7 @@ class _Training:
                 break
         progress.episode += 1
         progress.loss = float(np.mean(losses)) if losses else float("nan")
-        progress.seconds = time.monotonic() - self._started
+        self._folder.tick()
 
     def _observe(self) -> Observation:
         """The observation of a controller on the truth, without the noise on the state."""
@@ -199,42 +162,21 @@ class _Training:
         return min(max(action, -1.0), 1.0)
 
     def _rate_share(self) -> float:
-        done = self._progress.step / self._config.steps
+        done = self._progress.step / self._steps
         return 1.0 - (1.0 - self._algorithm.rate_end) * done
 
     def _evaluate(self) -> None:
-        """Drive the training track without noise; save the actor if it is the best so far."""
-        progress, config = self._progress, self._config
-        actor = self._actor(0.0)
-        result = _drive(actor, self._world.road)
-        score = result.per_step(config.reward)
-        if score > progress.best_score:
-            progress.best_score, progress.best_step = score, progress.step
-            save_actor(config.out, self._actor(score))
-        progress.evaluated = progress.step
-        progress.seconds = time.monotonic() - self._started
-        progress.curve.append(
-            (
-                progress.step,
-                round(progress.seconds, 1),
-                progress.episode,
-                progress.loss,
-                score,
-                result.mean_abs_d_m,
-                result.max_abs_d_m,
-            )
+        """Drive the training track without noise; keep the actor if it is the best so far."""
+        result = _drive(self._actor(0.0), self._world.road)
+        score = result.per_step(self._config.reward)
+        self._folder.add_evaluation(
+            score, result.mean_abs_d_m, result.max_abs_d_m, self._actor(score)
         )
-        rows = [COLUMNS, *progress.curve]
-        text = "\n".join(",".join(map(str, row)) for row in rows)
-        atomic_write(config.out / CURVE, text + "\n")
 
     def _actor(self, score: float) -> Actor:
         """The target actor: an average over the last updates, which steers more smoothly."""
         agent, algorithm, config = self._agent, self._algorithm, self._config
-        weights = {
-            name: array[0].reshape(-1) if name[0] == "b" else array[0]
-            for name, array in layers(agent.actor.target.copy(), agent.shape)._asdict().items()
-        }
+        assert config.track is not None
         card = ActorCard(
             state=config.state,
             parts=self._state.parts,
@@ -249,7 +191,7 @@ class _Training:
             score_per_step=score,
             reward=config.reward,
         )
-        return Actor(card, weights | {"w3": weights["w3"][:, 0]})
+        return Actor(card, agent.weights())
 
 
 def _drive(actor: Actor, road: Road) -> DriveResult:

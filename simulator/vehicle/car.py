@@ -8,7 +8,7 @@ distances (lf, lr) are also the paper's. Two values differ from the paper: its y
 """
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -165,9 +165,10 @@ class CarParameters:
 
     def packed(self) -> NDArray[Any]:
         """The parameters and numbers derived from them: an array (1,) for compiled code."""
+        values = [getattr(self, field.name) for field in fields(self)]
         layout = [
             (field.name, "f8", (len(value),) if isinstance(value, tuple) else ())
-            for field, value in zip(fields(self), astuple(self), strict=True)
+            for field, value in zip(fields(self), values, strict=True)
         ]
         layout += [(name, "f8", ()) for name in ("total_mass", "load_front", "load_rear")]
         layout += [(name, "f8", ()) for name in ("working_front", "working_rear")]
@@ -178,4 +179,4 @@ class CarParameters:
         rate = math.log((1.0 - self.friction_overloaded) / spread)
         slope = self.tyre_stiffness / self.tyre_shape
         derived = (self.total_mass, front, rear, nominal * front, nominal * rear, rate, slope)
-        return np.array([(*astuple(self), *derived)], dtype=layout)
+        return np.array([(*values, *derived)], dtype=layout)

@@ -1,4 +1,4 @@
-"""Tracks, options and actions that the simulator refuses, and graphics that it lacks.
+"""What the simulator and the training of controllers refuse, and graphics that are missing.
 
 `TRIES` has an attempt for each row of the page of errors, by the first words of the row.
 """
@@ -12,6 +12,9 @@ import gymnasium as gym
 import pytest
 
 import simulator.env  # noqa: F401  # registers the environments
+from controllers.rl.config import TrainConfig
+from controllers.rl.run_folder import stored_config
+from controllers.rl.training import train as train_actor
 from simulator.camera.core.context import Graphics
 from simulator.camera.core.turns import Turns
 from simulator.env.vector import DriverViewVector, LateralControlVector
@@ -34,6 +37,10 @@ def on_oval(command: Command | None = None, **start: float) -> object:
 
 
 TRIES: dict[str, Try] = {
+    "many cars with a state": lambda folder: train_actor(
+        TrainConfig(folder / "run", "td3", envs=8, state="residual")
+    ),
+    "a folder to continue": stored_config,
     "a lane width for varied": lambda folder: make_road(find_track("oval"), 1, 3.5, "varied"),
     "an action or command": lambda folder: on_oval(Command(steer=1.00001)),
     "a start outside": lambda folder: on_oval(to_middle=40.0),

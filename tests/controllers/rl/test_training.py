@@ -94,7 +94,39 @@ def test_mirrored_transitions_are_those_of_the_mirrored_road() -> None:
     assert batch.next_states[0, 2] == 4.0
 
 
-@pytest.mark.parametrize("state", list(STATES))
+GOLDEN = {
+    # Losses of the first and the 40th update, an action, sums of the absolute parameters.
+    "ddpg": (0.344524, 0.360488, -0.0167356, (358.93695, 358.24844, 361.78189, 360.45319)),
+    "td3": (811.14625, 772.4165, 0.0163913, (359.44373, 358.27277, 735.79144, 715.5995)),
+}
+"""From commit df7eed5, before trainings with many cars."""
+
+
+@pytest.mark.parametrize("name", list(GOLDEN))
+def test_40_updates_give_the_numbers_of_before(name: str) -> None:
+    agent, rng = Agent(ALGORITHMS[name], PAPER, 0), np.random.default_rng(1)
+    for _ in range(200):
+        state, after = rng.normal(0, 0.3, (2, 7)).astype(np.float32)
+        action, reward = rng.uniform(-1, 1), rng.uniform(-1, 1)
+        agent.remember(agent.see(state), action, reward, agent.see(after), bool(rng.random() < 0.1))
+    losses = [agent.update(rng, 1.0) for _ in range(40)]
+    asked = np.array([0, 0.3, 0, 0, 0, 0, 0], np.float32)
+    sizes = [
+        float(np.abs(getattr(of, part)).sum())
+        for of in (agent.actor, agent.critics)
+        for part in ("theta", "target")
+    ]
+    first, last, action, expected = GOLDEN[name]
+    assert (losses[0], losses[-1]) == pytest.approx((first, last), rel=1e-4)
+    assert agent.act(agent.see(asked)) == pytest.approx(action, rel=1e-3)
+    assert sizes == pytest.approx(expected, rel=1e-5)
+    rows = np.stack((asked, -2.0 * asked))
+    assert agent.act_all(agent.see(rows)) == pytest.approx(
+        [agent.act(agent.see(row)) for row in rows], abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("state", ["paper", "stacked", "residual", "history"])
 def test_a_stopped_training_resumes_to_the_same_bits(tmp_path: Path, state: str) -> None:
     whole = train(short(tmp_path / "whole", state=state))
 
@@ -203,8 +235,8 @@ def test_the_command_trains_and_drives(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--algorithm", "sarsa"), "no algorithm 'sarsa'; use one of: ddpg, td3"),
-        (("--state", "pixels"), "no state 'pixels'; use one of: paper, stacked, residual"),
+        (("--algorithm", "sarsa"), "no algorithm 'sarsa'; use one of: ddpg, td3, ppo"),
+        (("--state", "pixels"), "no state 'pixels'; use one of: paper, stacked, residual, history"),
         (("--track", "nowhere"), "no track 'nowhere'"),
         (("--state-noise", "-1"), "noise is -1"),
         (("--actor-rate", "0"), "learning rate 0.0"),

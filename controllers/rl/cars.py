@@ -1,0 +1,212 @@
+"""The cars of a training in one vector environment, with random roads, cars and sensors.
+
+Each number of a state is an array over N cars. The lateral offset is divided by one half width, as
+in a drive: a controller does not know the width of the road. SI units, track frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from controllers.drive.config import THROTTLE
+from controllers.drive.disturbance import ANGLE_NOISE_RAD, OFFSET_NOISE_M, SPEED_NOISE_M_S
+from controllers.laws.actor_state import HISTORY, HISTORY_STEPS, StateDefinition, history_state
+from simulator.env.reward import OFF_TRACK_REWARD, quadratic_reward
+from simulator.env.vector import LateralControlVector
+from simulator.track.catalogue import find_track
+from simulator.track.random_roads.road import RANDOM
+from trackfeatures.state_vector import SPEED_SCALE_M_S, STATE_SIZE
+
+Array = NDArray[np.float32]
+
+FRICTION, MASS = (0.8, 1.25), (0.85, 1.15)
+"""Factors on the friction and the mass of disturbed cars."""
+THROTTLES = (THROTTLE, 0.3)
+"""Throttle of disturbed cars. With less than THROTTLE a car does not climb alpine-2."""
+DELAYS = 3
+"""A disturbed car sees the road as it was 0 to DELAYS - 1 steps (of 50 ms) ago."""
+PERCEIVED = (0, 1, 4, 5, 6)
+"""The numbers of the paper's state that the perception measures; the car's speeds are not late."""
+EPISODE_STEPS = (200, 800)
+STANDING = 0.25
+"""Share of the cars that start at rest; the others roll."""
+START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}
+START_SPEED = (0.0, 18.0)
+GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
+"""Multiples of it modulo 1 are spread evenly, whatever the number of tracks."""
+RANDOM_START_M = 3000.0
+"""Range of the start on random roads, which differ in length."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a control step of N cars led to."""
+
+    last: Array  # (N, size), the states after the step
+    states: Array  # (N, size), the same, but the first states of new episodes
+    rewards: NDArray[np.float64]  # (N,)
+    ended: NDArray[np.bool_]  # (N,), whether the episode reached a terminal state
+    over: NDArray[np.bool_]  # (N,), whether it ended, also by its number of steps
+    offsets_m: NDArray[np.float64]  # (N,), from the middle, left positive
+
+
+class Cars:
+    """N cars on `tracks` (N names); those of `disturbed` (N,) differ in each episode.
+
+    `starts`: options of the reset; `episode`: least and greatest number of steps of an episode.
+    """
+
+    def __init__(
+        self,
+        definition: StateDefinition,
+        tracks: Sequence[str],
+        disturbed: NDArray[np.bool_],
+        *,
+        starts: dict[str, Any],
+        episode: tuple[int, int],
+        half_width_m: float,
+        reward: str = "paper",
+        state_noise: float = 0.0,
+        threads: int = 1,
+        tracks_dir: Path | None = None,
+    ) -> None:
+        self.count = len(tracks)
+        self._history = definition.name == HISTORY.name
+        self._disturbed, self._episode = disturbed, episode
+        self._half_width_m, self._quadratic = half_width_m, reward == "quadratic"
+        self._state_noise = state_noise
+        drawn: dict[str, Any] = {
+            name: [range_ if one else 1.0 for one in disturbed.tolist()]
+            for name, range_ in (("friction", FRICTION), ("mass", MASS))
+        }
+        self._envs = LateralControlVector(
+            self.count,
+            list(tracks),
+            controls="full",
+            autoreset_mode=AutoresetMode.DISABLED,
+            max_episode_steps=None,
+            threads=threads,
+            start=starts,
+            tracks_dir=tracks_dir,
+            **drawn,
+        )
+        self._actions = np.zeros((self.count, 4))
+        self._actions[:, 3] = 1.0
+        self._left = np.zeros(self.count, np.int64)
+        self._delay = np.zeros(self.count, np.int64)
+        self._noise = np.zeros(self.count)
+        self._late = np.zeros((DELAYS, self.count, STATE_SIZE), np.float32)
+        self._recent = np.zeros((self.count, HISTORY_STEPS, STATE_SIZE), np.float32)
+        self._everyone = np.ones(self.count, np.bool_)
+
+    def reset(self, seed: int) -> Array:
+        """Begin an episode of each car; all that follows depends on `seed` and the actions."""
+        self._rng = np.random.default_rng(seed)
+        observed, info = self._envs.reset(seed=seed)
+        self._begin(self._everyone)
+        return self._perceive(observed, info, self._everyone)
+
+    def step(self, steering: Array) -> Step:
+        """Advance all cars by a control step with `steering` (N,) in [-1, 1]."""
+        self._actions[:, 0] = steering
+        observed, rewards, ended, _, info = self._envs.step(self._actions)
+        offsets, none = info["to_middle"], np.zeros(self.count, np.bool_)
+        if self._quadratic:
+            steers: Any = self._actions[:, 0]  # the formula takes arrays, too
+            running = quadratic_reward(offsets, info["angle"], steers, False)
+            rewards = np.where(ended, OFF_TRACK_REWARD, running)
+        last = states = self._perceive(observed, info, none)
+        self._left -= 1
+        over = ended | (self._left <= 0)
+        if over.any():
+            observed, info = self._envs.reset(options={"reset_mask": over})
+            self._begin(over)
+            states = np.where(over[:, None], self._perceive(observed, info, over), last)
+        return Step(last, states, rewards, ended, over, offsets)
+
+    def close(self) -> None:
+        self._envs.close()
+
+    def _begin(self, new: NDArray[np.bool_]) -> None:
+        """Draw throttle, delay, noise and length of the episodes of the `new` cars (N,)."""
+        low, high = self._episode
+        lengths = self._rng.integers(low, high, self.count, endpoint=True)
+        throttles = self._rng.uniform(*THROTTLES, self.count)
+        delays = self._rng.integers(DELAYS, size=self.count)
+        noises = self._rng.uniform(0.0, 1.0, self.count)
+        of = self._disturbed
+        self._left = np.where(new, lengths, self._left)
+        self._actions[new, 1] = np.where(of, throttles, THROTTLE)[new]
+        self._delay[new] = np.where(of, delays, 0)[new]
+        self._noise[new] = np.where(of, noises, 0.0)[new]
+
+    def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
+        """The states (N, size); the memory of `new` cars (N,) begins with their present state.
+
+        With `new` cars only their states are valid, and the memory of the others stays.
+        """
+        exact = observed.copy()
+        exact[:, 0] = info["to_middle"] / self._half_width_m
+        if new.any():
+            self._late[:, new] = exact[new]
+        else:
+            self._late[1:] = self._late[:-1].copy()
+            self._late[0] = exact
+        seen = exact
+        seen[:, PERCEIVED] = self._late[self._delay, np.arange(self.count)][:, PERCEIVED]
+        self._add_noise(seen)
+        if not self._history:
+            return seen
+        if new.any():
+            self._recent[new] = seen[new, None]
+        else:
+            self._recent[:, 1:] = self._recent[:, :-1].copy()
+            self._recent[:, 0] = seen
+        return history_state(self._recent)
+
+    def _add_noise(self, seen: Array) -> None:
+        if self._state_noise:
+            seen += self._rng.normal(0.0, self._state_noise, seen.shape)
+        if self._disturbed.any():
+            spread = (
+                *(OFFSET_NOISE_M / self._half_width_m, ANGLE_NOISE_RAD / np.pi),
+                *(SPEED_NOISE_M_S / SPEED_SCALE_M_S,) * 2,
+            )
+            drawn = self._rng.standard_normal((self.count, 4), np.float32)
+            seen[:, :4] += drawn * (self._noise[:, None] * spread).astype(np.float32)
+
+
+def random_cars(
+    definition: StateDefinition,
+    count: int,
+    tracks: Sequence[str],
+    disturbed: float,
+    **options: Any,
+) -> Cars:
+    """`count` cars that start at random places and motions: of each two cars one on the next of
+    `tracks`, the other on random roads, with one track all on it.
+
+    `disturbed`: share of the disturbed cars, evenly spread over the tracks; `options`: those of
+    `Cars` that are not set here.
+    """
+    several = len(tracks) > 1
+    pairs = np.arange(count) // (2 if several else 1)
+    chosen = [
+        RANDOM if several and number % 2 else tracks[pair % len(tracks)]
+        for number, pair in enumerate(pairs.tolist())
+    ]
+    ranks = np.argsort(np.argsort(np.unique(pairs) * GOLDEN_RATIO % 1.0))
+    disturbs = (ranks < disturbed * len(ranks))[pairs]
+    folder = options.get("tracks_dir")
+    lengths = {name: find_track(name, folder).length_m for name in set(chosen) - {RANDOM}}
+    standing = np.random.default_rng(count).random(count) < STANDING
+    starts = START | {
+        "s": [(0.0, lengths.get(name, RANDOM_START_M)) for name in chosen],
+        "speed": [0.0 if still else START_SPEED for still in standing.tolist()],
+    }
+    return Cars(definition, chosen, disturbs, starts=starts, episode=EPISODE_STEPS, **options)

@@ -1,0 +1,73 @@
+"""DDPG and TD3 with many cars: the same agent and updates as with one car, on larger batches."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from controllers.laws.actor_state import StateDefinition
+from controllers.rl.agent import Agent
+from controllers.rl.cars import Array, Step
+from controllers.rl.checkpoint import Tensors
+from controllers.rl.config import EXPLORATION_NOISE, Algorithm, exploration_share
+
+BATCH = 256
+"""Transitions per update; a transition takes half the time that it takes in a batch of 64."""
+STEPS_PER_UPDATE = 8
+"""Steps of all cars together for one update."""
+
+
+class OffPolicy:
+    """The learner: `explore` and `learn` are called in turn, once for each step of the cars."""
+
+    horizon = 1
+
+    def __init__(
+        self, algorithm: Algorithm, definition: StateDefinition, cars: int, seed: int
+    ) -> None:
+        self._agent = Agent(replace(algorithm, batch=BATCH), definition, seed)
+        self._updates = max(cars // STEPS_PER_UPDATE, 1)
+        self.divisor, self.odd = self._agent.divisor, algorithm.mirrored
+
+    def act(self, states: Array) -> Array:
+        """The actions (N,) of the present actor for states (N, size)."""
+        return self._agent.act_all(self._agent.see(states))
+
+    def explore(self, states: Array, rng: np.random.Generator) -> Array:
+        """Actions (N,) with the paper's noise, which is added with the probability of this step."""
+        agent, count = self._agent, len(states)
+        noise = agent.algorithm.beta * EXPLORATION_NOISE * rng.standard_normal(count, np.float32)
+        noise *= rng.random(count) < exploration_share(agent.replay.added)
+        return np.clip(self.act(states) + noise, -1.0, 1.0)
+
+    def learn(
+        self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
+    ) -> dict[str, float]:
+        """Add the transitions of a step and update; returns figures of the updates.
+
+        `left`: share of the training that is left.
+        """
+        agent, of = self._agent, self._agent.algorithm
+        rows = zip(
+            *(agent.see(states), actions.tolist(), step.rewards.tolist()),
+            *(agent.see(step.last), step.ended.tolist()),
+            strict=True,
+        )
+        for row in rows:
+            agent.remember(*row)
+        if len(agent.replay) < of.learning_starts:
+            return {}
+        share = of.rate_end + (1.0 - of.rate_end) * left
+        losses = [agent.update(rng, share) for _ in range(self._updates)]
+        return {"loss": float(np.mean(losses)), "reward": float(step.rewards.mean())}
+
+    def weights(self) -> dict[str, Array]:
+        """The arrays of the actor as in an actor's file."""
+        return self._agent.weights()
+
+    def store(self) -> tuple[Tensors, dict[str, int]]:
+        """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
+        return self._agent.store()
+
+    def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
+        """Continue from the arrays and counts of a checkpoint."""
+        self._agent.restore(tensors, counts)

@@ -1,0 +1,279 @@
+"""Proximal policy optimisation (Schulman et al. 2017) on torch, in the form of CleanRL.
+
+The policy is a normal distribution of the steering around the actor's action, with a learned
+standard deviation that does not depend on the state. Advantages are generalised advantage estimates
+(Schulman et al. 2016). Differences from CleanRL's `ppo_continuous_action.py`:
+
+- The hidden layers have ReLU, and the mean action is odd: half the difference between tanh of the
+  network's outputs for the state and for its mirror image. So the actor's files are those of `td3`.
+- An episode that is cut by its number of steps continues with the value of its last state.
+- Advantages are divided by their mean distance from their mean, not by their standard deviation,
+  and limited to 4 times it: an end costs hundreds of times as much as a usual step, and would hide
+  all others.
+- The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
+  there is no bonus for entropy.
+- Rewards and states are scaled by constants instead of running means.
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from controllers.laws.actor import NAMES, mirror_of
+from controllers.laws.actor_state import StateDefinition
+from controllers.rl.cars import Array, Step
+from controllers.rl.checkpoint import Tensors
+from controllers.rl.config import PpoSettings
+
+ADAM_EPSILON = 1e-5
+ADVANTAGE_LIMIT = 4.0
+LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+def advantages_of(
+    rewards: Array,
+    values: Array,
+    next_values: Array,
+    ended: NDArray[np.bool_],
+    over: NDArray[np.bool_],
+    discount: float,
+    gae_lambda: float,
+) -> Array:
+    """Generalised advantage estimates (T, N).
+
+    All arguments are (T, N). `next_values`: values of the states that the steps led to, before any
+    reset; after a terminal state (`ended`) no reward follows. An episode that is `over` passes
+    nothing on to the next one.
+    """
+    found = np.zeros_like(rewards)
+    errors = rewards + discount * next_values * ~ended - values
+    following = np.zeros_like(rewards[0])
+    for t in reversed(range(len(rewards))):
+        following = errors[t] + discount * gae_lambda * ~over[t] * following
+        found[t] = following
+    return found
+
+
+def scaled(advantages: Tensor) -> Tensor:
+    """`advantages` (B,) over their mean distance from their mean, limited to ADVANTAGE_LIMIT."""
+    centred = advantages - advantages.mean()
+    return (centred / (centred.abs().mean() + 1e-8)).clamp(-ADVANTAGE_LIMIT, ADVANTAGE_LIMIT)
+
+
+def clipped_loss(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
+    """-mean min(r A, clip(r, 1 - clip, 1 + clip) A) with r = exp(log_ratio); inputs (B,)."""
+    ratio = log_ratio.exp()
+    limited = ratio.clamp(1.0 - clip, 1.0 + clip)
+    return -torch.min(ratio * advantages, limited * advantages).mean()
+
+
+def log_density(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
+    """Logarithm of the normal density of `actions` (B,)."""
+    z = (actions - means) * torch.exp(-log_std)
+    return -0.5 * z * z - log_std - LOG_SQRT_2PI
+
+
+class Policy(nn.Module):
+    """The actor with its standard deviation, and the critic, for scaled states (B, size)."""
+
+    def __init__(
+        self, definition: StateDefinition, settings: PpoSettings, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        order, signs = mirror_of(definition)
+        self._order, self._signs = torch.from_numpy(order), torch.from_numpy(signs)
+        self.actor = _layers(definition.size, settings.hidden, 0.01, generator)
+        self.critic = _layers(definition.size, settings.hidden, 1.0, generator)
+        self.log_std = nn.Parameter(torch.tensor(math.log(settings.first_std)))
+
+    def mean(self, states: Tensor) -> Tensor:
+        """The mean actions (B,), in (-1, 1)."""
+        mirrored = states[:, self._order] * self._signs
+        out = torch.tanh(self.actor(torch.cat((states, mirrored))).squeeze(1))
+        return 0.5 * (out[: len(states)] - out[len(states) :])
+
+    def value(self, states: Tensor) -> Tensor:
+        """The values (B,)."""
+        values: Tensor = self.critic(states).squeeze(1)
+        return values
+
+
+def _layers(
+    size: int, hidden: tuple[int, int], gain: float, generator: torch.Generator
+) -> nn.Sequential:
+    """Two hidden layers with ReLU and one output, with orthogonal initial weights."""
+    widths = (size, *hidden, 1)
+    linears = [nn.Linear(*pair) for pair in pairwise(widths)]
+    for linear, factor in zip(linears, (math.sqrt(2.0), math.sqrt(2.0), gain), strict=True):
+        nn.init.orthogonal_(linear.weight, factor, generator=generator)
+        nn.init.zeros_(linear.bias)
+    first, second, last = linears
+    return nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
+
+
+@dataclass
+class Rollout:
+    """The last T steps of N cars, (T, N) and (T, N, size)."""
+
+    states: Array
+    last: Array
+    actions: Array
+    rewards: Array
+    ended: NDArray[np.bool_]
+    over: NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls, horizon: int, cars: int, size: int) -> "Rollout":
+        states, last = np.zeros((2, horizon, cars, size), np.float32)
+        actions, rewards = np.zeros((2, horizon, cars), np.float32)
+        ended, over = np.zeros((2, horizon, cars), np.bool_)
+        return cls(states, last, actions, rewards, ended, over)
+
+
+class Ppo:
+    """The learner: `explore` and `learn` are called in turn, once for each step of the cars."""
+
+    def __init__(
+        self, settings: PpoSettings, definition: StateDefinition, cars: int, seed: int
+    ) -> None:
+        self.settings, self.odd = settings, True
+        self.horizon = settings.horizon
+        self.policy = Policy(definition, settings, torch.Generator().manual_seed(seed))
+        self._actor = [*self.policy.actor.parameters(), self.policy.log_std]
+        self._critic = list(self.policy.critic.parameters())
+        self._adam = torch.optim.Adam(
+            [{"params": self._actor}, {"params": self._critic}], eps=ADAM_EPSILON
+        )
+        self.divisor = np.array(definition.spread, np.float32)
+        self._rollout = Rollout.empty(self.horizon, cars, definition.size)
+        self._filled = 0
+
+    def act(self, states: Array) -> Array:
+        """The mean actions (N,) for states (N, size)."""
+        with torch.no_grad():
+            means: Array = self.policy.mean(torch.from_numpy(states / self.divisor)).numpy()
+        return means
+
+    def explore(self, states: Array, rng: np.random.Generator) -> Array:
+        """Actions (N,) drawn from the policy; they may exceed [-1, 1]."""
+        noise = rng.standard_normal(len(states), np.float32)
+        return self.act(states) + noise * np.float32(math.exp(self.policy.log_std.item()))
+
+    def learn(
+        self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
+    ) -> dict[str, float]:
+        """Add a step; every `horizon` steps update the networks and return figures of the update.
+
+        `left`: share of the training that is left.
+        """
+        of, row, k = self.settings, self._rollout, self._filled
+        row.states[k], row.actions[k] = states / self.divisor, actions
+        row.last[k] = step.last / self.divisor
+        end = of.reward_baseline * of.discount / (1.0 - of.discount)
+        row.rewards[k] = of.reward_scale * (step.rewards - of.reward_baseline - end * step.ended)
+        row.ended[k], row.over[k] = step.ended, step.over
+        self._filled = (k + 1) % self.horizon
+        if self._filled:
+            return {}
+        share = of.rate_end + (1.0 - of.rate_end) * left
+        for group, rate in zip(
+            self._adam.param_groups, (of.actor_rate, of.critic_rate), strict=True
+        ):
+            group["lr"] = rate * share
+        return self._update(rng)
+
+    def _update(self, rng: np.random.Generator) -> dict[str, float]:
+        of, row = self.settings, self._rollout
+        shape, size = row.actions.shape, row.states.shape[2]
+        states = torch.from_numpy(row.states.reshape(-1, size))
+        actions = torch.from_numpy(row.actions.reshape(-1))
+        with torch.no_grad():
+            values = self.policy.value(states)
+            before = log_density(actions, self.policy.mean(states), self.policy.log_std)
+            next_values = self._next_values(values.numpy().reshape(shape))
+        advantages = advantages_of(
+            row.rewards,
+            values.numpy().reshape(shape),
+            next_values,
+            row.ended,
+            row.over,
+            of.discount,
+            of.gae_lambda,
+        )
+        gained = torch.from_numpy(advantages.reshape(-1))
+        returns = gained + values
+        losses = []
+        for _ in range(of.epochs):
+            order = torch.from_numpy(rng.permutation(len(states)))
+            for chosen in order.chunk(of.minibatches):
+                batch = states[chosen], actions[chosen], before[chosen]
+                losses.append(self._descend(*batch, gained[chosen], returns[chosen]))
+        actor, critic, kl = np.mean(losses, axis=0).tolist()
+        explained = 1.0 - float((returns - values).var() / (returns.var() + 1e-8))
+        return {
+            "loss": critic,
+            "actor_loss": actor,
+            "kl": kl,
+            "std": math.exp(self.policy.log_std.item()),
+            "explained_variance": explained,
+            "reward": float(row.rewards.mean()),
+            "ended_share": float(row.ended.mean()),
+        }
+
+    def _next_values(self, values: Array) -> Array:
+        """Values (T, N) of the states that the steps led to."""
+        row = self._rollout
+        found = np.empty_like(values)
+        found[:-1] = values[1:]
+        asked = row.over.copy()
+        asked[-1] = True
+        found[asked] = self.policy.value(torch.from_numpy(row.last[asked])).numpy()
+        return found
+
+    def _descend(
+        self, states: Tensor, actions: Tensor, before: Tensor, gained: Tensor, returns: Tensor
+    ) -> tuple[float, float, float]:
+        """One step on a minibatch; returns the losses and the mean divergence from the policy
+        before the update."""
+        of, policy = self.settings, self.policy
+        log_ratio = log_density(actions, policy.mean(states), policy.log_std) - before
+        actor = clipped_loss(log_ratio, scaled(gained), of.clip)
+        critic = 0.5 * ((policy.value(states) - returns) ** 2).mean()
+        self._adam.zero_grad(set_to_none=True)
+        (actor + critic).backward()  # type: ignore[no-untyped-call]
+        for part in (self._actor, self._critic):
+            nn.utils.clip_grad_norm_(part, of.max_gradient)
+        self._adam.step()
+        with torch.no_grad():
+            kl = (log_ratio.exp() - 1.0 - log_ratio).mean()
+        return actor.item(), critic.item(), kl.item()
+
+    def weights(self) -> dict[str, Array]:
+        """The arrays of the actor as in an actor's file."""
+        linears = [layer for layer in self.policy.actor if isinstance(layer, nn.Linear)]
+        w1, w2, w3 = (linear.weight.detach().numpy().T.copy() for linear in linears)
+        b1, b2, b3 = (linear.bias.detach().numpy().copy() for linear in linears)
+        return dict(zip(NAMES, (w1, b1, w2, b2, w3[:, 0].copy(), b3), strict=True))
+
+    def store(self) -> tuple[Tensors, dict[str, int]]:
+        """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
+        tensors: Tensors = {}
+        for name, parameter in self.policy.named_parameters():
+            tensors[f"policy.{name}"] = parameter.detach().numpy()
+            for part, value in self._adam.state[parameter].items():
+                tensors[f"adam.{name}.{part}"] = value.numpy()
+        return tensors, {}
+
+    def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
+        """Continue from the arrays of a checkpoint."""
+        for name, parameter in self.policy.named_parameters():
+            parameter.data.copy_(torch.from_numpy(tensors[f"policy.{name}"]))
+            moments: dict[str, Any] = self._adam.state[parameter]
+            for part in ("step", "exp_avg", "exp_avg_sq"):
+                moments[part] = torch.from_numpy(tensors[f"adam.{name}.{part}"].copy())

@@ -1,0 +1,152 @@
+"""The folder of a training: its options, its curves, and the best actor.
+
+`config.json` has the options, `curve.csv` and `tensorboard/` (where the package is installed) a
+point for each evaluation, `actor.safetensors` and `actor.json` the best actor.
+"""
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from controllers.laws.actor import Actor, save_actor
+from controllers.rl.checkpoint import Learner, Progress, load_checkpoint, save_checkpoint
+from controllers.rl.config import TrainConfig, resolve
+from runtime.files import atomic_write, write_json
+from trackfeatures.errors import UserError
+
+if TYPE_CHECKING:
+    from runtime.tensorboard import TensorBoardWriter
+
+CONFIG, CURVE, TENSORBOARD = "config.json", "curve.csv", "tensorboard"
+COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
+UNCOMPARED = ("out", "threads", "resume")
+"""Options that may differ when a training continues: the folder may have been moved."""
+
+
+def stored_config(run: Path) -> TrainConfig:
+    """The configuration of the training in the folder `run`, to continue it.
+
+    Raises UserError if there is none, or if its file is damaged.
+    """
+    if not (run / CONFIG).is_file():
+        raise UserError(
+            f"{run} holds no training ({CONFIG} is missing); give the --out of a training to "
+            "continue, or leave --resume out"
+        )
+    return replace(_read(run / CONFIG), out=run)
+
+
+def prepare_folder(config: TrainConfig) -> None:
+    """Make the folder of the run, or check that it contains a run of the same configuration."""
+    path = config.out / CONFIG
+    if not path.exists():
+        config.out.mkdir(parents=True, exist_ok=True)
+        write_json(path, _content(config))
+        return
+    found, now = _content(_read(path)), _content(config)
+    changed = [name for name in now if name not in UNCOMPARED and found[name] != now[name]]
+    if changed:
+        raise UserError(
+            f"{config.out} holds a training with another {', '.join(changed)}; give another "
+            "--out, or --resume to continue it"
+        )
+
+
+def _content(config: TrainConfig) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(json.dumps(asdict(config), default=str))
+    return content
+
+
+def _read(path: Path) -> TrainConfig:
+    """The options in a `config.json`; it lacks those that were added after its training."""
+    try:
+        found = dict(json.loads(path.read_text(encoding="utf-8")))
+        known = {
+            field.name: found[field.name] for field in fields(TrainConfig) if field.name in found
+        }
+        for name in ("out", "tracks_dir"):
+            if known.get(name) is not None:
+                known[name] = Path(known[name])
+        return resolve(TrainConfig(**known))
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({error}); give another --out") from error
+
+
+def _open_tensorboard(folder: Path, purge_step: int | None) -> "TensorBoardWriter | None":
+    """A writer of TensorBoard's files; None if the package is not installed."""
+    if find_spec("tensorboard") is None:
+        return None
+    from runtime.tensorboard import TensorBoardWriter
+
+    return TensorBoardWriter(folder, purge_step)
+
+
+class RunFolder:
+    """The files of one training, from its checkpoint if it has one."""
+
+    def __init__(self, run: Path, learner: Learner) -> None:
+        self._run, self._learner = run, learner
+        resumed = load_checkpoint(run, learner)
+        self.progress = resumed or Progress()
+        self._started = time.monotonic() - self.progress.seconds
+        step = self.progress.step + 1 if resumed else None
+        self._tensorboard = _open_tensorboard(run / TENSORBOARD, step)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._tensorboard is not None:
+            self._tensorboard.close()
+
+    def tick(self) -> None:
+        """Update the duration of the training."""
+        self.progress.seconds = time.monotonic() - self._started
+
+    def add_point(self, values: Mapping[str, float]) -> None:
+        """Add a point to TensorBoard's curves of the training."""
+        if self._tensorboard is not None:
+            named = {f"train/{name}": value for name, value in values.items()}
+            self._tensorboard.add(self.progress.step, named)
+
+    def add_evaluation(self, score: float, mean_m: float, max_m: float, actor: Actor) -> None:
+        """Add a point to the curves, keep the `actor` if it is the best, and write a checkpoint."""
+        progress = self.progress
+        self.tick()
+        if score > progress.best_score:
+            progress.best_score, progress.best_step = score, progress.step
+            save_actor(self._run, actor)
+        progress.evaluated = progress.step
+        seconds = round(progress.seconds, 1)
+        row = (progress.step, seconds, progress.episode, progress.loss, score, mean_m, max_m)
+        progress.curve.append(row)
+        text = "\n".join(",".join(map(str, row)) for row in (COLUMNS, *progress.curve))
+        atomic_write(self._run / CURVE, text + "\n")
+        if self._tensorboard is not None:
+            named = {
+                f"drive/{name}": value for name, value in zip(COLUMNS[3:], row[3:], strict=True)
+            }
+            self._tensorboard.add(progress.step, named)
+        save_checkpoint(self._run, self._learner, progress)
+
+    def result(self) -> dict[str, Any]:
+        """The result of the command."""
+        progress = self.progress
+        return {
+            "out": str(self._run),
+            "steps": progress.step,
+            "episodes": progress.episode,
+            "seconds": round(progress.seconds, 1),
+            "best_step": progress.best_step,
+            "best_score_per_step": progress.best_score,
+        }

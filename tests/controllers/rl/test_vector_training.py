@@ -1,0 +1,187 @@
+"""Trainings with many cars: resumed to the same bits, curves, the command, refusals."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controllers.laws.actor import load_actor
+from controllers.rl import vector_training
+from controllers.rl.config import TrainConfig, resolve
+from controllers.rl.training import train
+from tests.typed import error_line, typed
+from trackfeatures.errors import UserError
+
+pytest.importorskip("torch")
+
+CARS = 4
+UPDATE = 64 * CARS
+"""Steps between two updates of PPO."""
+
+
+@pytest.fixture(autouse=True)
+def _short_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vector_training, "EVALUATION_STEPS", 60)
+
+
+def short(out: Path, **changes: Any) -> TrainConfig:
+    """A training of a second."""
+    config = TrainConfig(
+        out=out,
+        algorithm="ppo",
+        envs=CARS,
+        track="oval",
+        steps=3 * UPDATE,
+        evaluate_every=UPDATE,
+        threads=1,
+    )
+    return replace(config, **changes)
+
+
+def actor_of(run: Path) -> tuple[bytes, bytes]:
+    return (run / "actor.safetensors").read_bytes(), (run / "actor.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "state"), [("ppo", "paper"), ("ppo", "history"), ("td3", "paper")]
+)
+def test_a_stopped_training_resumes_to_the_same_bits(
+    tmp_path: Path, algorithm: str, state: str
+) -> None:
+    changes = {"algorithm": algorithm, "state": state}
+    train(short(tmp_path / "whole", **changes))
+
+    def stop(step: int, best: float) -> None:
+        if step == 2 * UPDATE + 10 * CARS:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(short(tmp_path / "parts", **changes), stop)
+    stopped = (tmp_path / "parts" / "curve.csv").read_text().splitlines()
+    result = train(short(tmp_path / "parts", **changes))
+
+    assert len(stopped) == 3
+    assert result["steps"] == 3 * UPDATE
+    assert actor_of(tmp_path / "whole") == actor_of(tmp_path / "parts")
+    whole, parts = (
+        (tmp_path / run / "checkpoint.safetensors").read_bytes() for run in ("whole", "parts")
+    )
+    begin = [int.from_bytes(data[:8], "little") + 8 for data in (whole, parts)]
+    assert whole[begin[0] :] == parts[begin[1] :]
+
+
+def test_the_same_seed_gives_the_same_actor_and_another_one_another(tmp_path: Path) -> None:
+    for name, seed in (("one", 1), ("two", 1), ("other", 2)):
+        train(short(tmp_path / name, seed=seed, steps=UPDATE))
+    assert actor_of(tmp_path / "one") == actor_of(tmp_path / "two")
+    assert actor_of(tmp_path / "one")[0] != actor_of(tmp_path / "other")[0]
+
+
+def test_the_threads_of_the_cars_change_nothing_and_may_change(tmp_path: Path) -> None:
+    train(short(tmp_path, steps=UPDATE))
+    assert train(short(tmp_path, steps=UPDATE, threads=2))["steps"] == UPDATE
+
+
+def test_the_curves_of_a_training(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train(short(tmp_path, reward="quadratic"))
+    curve = np.genfromtxt(tmp_path / "curve.csv", delimiter=",", names=True)
+    assert curve["step"].tolist() == [UPDATE, 2 * UPDATE, 3 * UPDATE]
+    assert curve["score_per_step"].max() < 0.0
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    drives = events.Scalars("drive/score_per_step")
+    assert [point.step for point in drives] == curve["step"].tolist()
+    assert [point.value for point in drives] == pytest.approx(curve["score_per_step"].tolist())
+    assert [point.step for point in events.Scalars("train/kl")] == curve["step"].tolist()
+    card = load_actor(tmp_path).card
+    assert (card.algorithm, card.reward, card.track) == ("ppo", "quadratic", "oval")
+    assert card.half_width_m == 7.0
+    assert card.score_per_step == curve["score_per_step"].max()
+
+
+def test_the_evaluation_is_the_drive_of_the_command(tmp_path: Path) -> None:
+    """Its score is that of `controllers drive` from the same start."""
+    train(short(tmp_path, steps=UPDATE))
+    done = typed(
+        *("controllers", "drive", "--controller", tmp_path, "--track", "oval", "--steps", "60"),
+        *("--start-d", str(-14.0 / 6.0), "--json"),
+    )
+    assert done.returncode == 0, done.stderr
+    driven = json.loads(done.stdout)["score_per_step"]
+    assert driven == pytest.approx(load_actor(tmp_path).card.score_per_step, abs=1e-6)
+    assert driven > 0.3
+
+
+def test_an_actor_drives_without_torch(tmp_path: Path) -> None:
+    train(short(tmp_path, steps=UPDATE))
+    code = (
+        "import sys; from pathlib import Path; from controllers.laws.rl import load_controller;"
+        f"load_controller(Path({str(tmp_path)!r})); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_defaults_that_depend_on_the_number_of_cars() -> None:
+    one, many = resolve(TrainConfig()), resolve(TrainConfig(algorithm="ppo"))
+    assert (one.envs, one.track, one.steps, one.evaluate_every) == (1, "forza", 400_000, 20_000)
+    assert (many.envs, many.track) == (256, "all")
+    assert (many.steps, many.evaluate_every) == (20_000_000, 500_000)
+    assert resolve(TrainConfig(envs=64)).track == "all"
+    assert resolve(TrainConfig(envs=64, steps=5)).steps == 5
+
+
+def test_the_command_continues_with_the_stored_options(tmp_path: Path) -> None:
+    def stop(step: int, best: float) -> None:
+        if step > 2 * UPDATE:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train(short(out, seed=5), stop)
+    other = typed("controllers", "train", "--out", out, "--resume", "--seed", "6")
+    assert error_line(other).startswith(f"error: {out} was started with seed 5, now 6 is given")
+    done = typed("controllers", "train", "--out", out, "--resume", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["steps"] == 3 * UPDATE
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--algorithm", "ppo", "--state", "residual"), "--state residual needs --envs 1"),
+        (("--algorithm", "td3", "--envs", "8", "--state", "stacked"), "--state stacked needs"),
+        (("--track", "all"), "--track all needs several cars"),
+        (("--algorithm", "ppo", "--envs", "2", "--track", "nowhere"), "no track 'nowhere'"),
+        (("--algorithm", "ppo", "--actor-rate", "nan"), "learning rate nan"),
+        (("--algorithm", "ppo", "--state-noise", "-1", "--track", "oval"), "noise is -1"),
+        (("--resume",), "run holds no training"),
+    ],
+)
+def test_a_wrong_option_is_one_error_line(
+    tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    done = typed("controllers", "train", "--out", tmp_path / "run", *words)
+    assert done.returncode == 1
+    assert message in error_line(done)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("words", [("--envs", "0"), ("--disturbed", "1.5"), ("--threads", "0")])
+def test_numbers_out_of_range_are_refused(words: tuple[str, ...]) -> None:
+    done = typed("controllers", "train", *words)
+    assert done.returncode == 2
+    assert words[0] in done.stderr
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    train(short(tmp_path, steps=UPDATE))
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"checkpoint .* cannot be read"):
+        train(short(tmp_path, steps=UPDATE))
