@@ -1,7 +1,11 @@
 """The input and output of a controller. SI units, track frame, left positive."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from operator import attrgetter
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from trackfeatures import RoadClass
 
@@ -26,11 +30,75 @@ class Observation:
     """1/m, left positive, of the road just ahead; None if it is not measured (on perception)."""
 
 
+_values = attrgetter(*(field.name for field in fields(Observation)))
+TO_LANE_CENTRE, ANGLE, HEADING, VX, VY, YAW_RATE, CURVATURE = range(7)
+"""Columns of `Observations.rows`, for compiled code."""
+OBSERVED = len(fields(Observation))
+
+
+class _Column:
+    """A column of `Observations.rows`."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def __get__(self, seen: "Observations", owner: object = None) -> NDArray[np.float64]:
+        return seen.rows[:, self.index]
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """One control step of N cars: each field of `Observation` is an array (N,)."""
+
+    rows: NDArray[np.float64]
+    """(N, OBSERVED): the fields of `Observation` in their order; NaN stands for None."""
+
+    to_lane_centre = _Column(TO_LANE_CENTRE)
+    angle = _Column(ANGLE)
+    heading = _Column(HEADING)
+    vx = _Column(VX)
+    vy = _Column(VY)
+    yaw_rate = _Column(YAW_RATE)
+    curvature = _Column(CURVATURE)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def split(self) -> list[Observation]:
+        """The observation of each car."""
+        found = []
+        for row in self.rows.tolist():
+            row[HEADING] = RoadClass(row[HEADING])
+            row[CURVATURE:] = [None if value != value else value for value in row[CURVATURE:]]
+            found.append(Observation(*row))
+        return found
+
+    @staticmethod
+    def of(observation: Observation) -> "Observations":
+        """The observations of one car."""
+        return Observations(np.array([_values(observation)], np.float64))  # NaN for None
+
+
 class Controller(Protocol):
     """A lateral controller. To add one, add a file to `laws` and an entry to `registry`."""
 
     def update(self, observation: Observation) -> float:
         """The steering action in [-1, 1], left positive; called once for each control step."""
+        ...
+
+
+class BatchController(Controller, Protocol):
+    """A controller that can also steer many cars in one call; comparisons then drive them at once.
+
+    A controller object steers either one car by `update`, or the same N cars by `update_batch`.
+    """
+
+    def update_batch(self, observations: Observations) -> NDArray[np.float64]:
+        """The steering actions (N,) of all cars; called once for each control step.
+
+        Car k must get the action that an `update` of a controller of its own returns. A car whose
+        drive is over keeps its last observation; its action is ignored.
+        """
         ...
 
 

@@ -7,6 +7,7 @@ import, also from the working folder; `FILE.py:CLASS` is a class of a file.
 import importlib
 import importlib.util
 import math
+import reprlib
 import sys
 import traceback
 from collections.abc import Callable, Mapping
@@ -16,8 +17,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from controllers.interface import Controller, LoopConfig, Observation
+from controllers.interface import Controller, LoopConfig, Observation, Observations
 from controllers.laws.actor import is_actor
 from trackfeatures.errors import UserError
 
@@ -149,20 +151,15 @@ def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
 
 
 class _OwnController:
-    """A user's controller; an error of its `update`, or a wrong result, becomes a UserError."""
+    """A user's controller; an error of its methods, or a wrong result, becomes a UserError."""
 
-    def __init__(self, name: str, controller: Controller) -> None:
+    def __init__(self, name: str, controller: Any) -> None:
         self._name, self._controller = name, controller
+        own_batch = callable(getattr(controller, "update_batch", None))
+        self.update_batch = self._update_batch if own_batch else None
 
     def update(self, observation: Observation) -> float:
-        try:
-            action = self._controller.update(observation)
-        except Exception as error:  # a user's method may raise anything
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            raise UserError(
-                f"update(observation) of {self._name} failed: {_line(error)} "
-                f"({place.filename}, line {place.lineno})"
-            ) from error
+        action = self._call("update(observation)", self._controller.update, observation)
         try:
             if math.isfinite(action):
                 return float(action)
@@ -172,6 +169,30 @@ class _OwnController:
             f"update(observation) of {self._name} returned {action!r}; it must return the steering "
             "action, a number in [-1, 1]"
         )
+
+    def _update_batch(self, observations: Observations) -> NDArray[np.float64]:
+        what, count = "update_batch(observations)", len(observations)
+        actions = self._call(what, self._controller.update_batch, observations)
+        try:
+            found = np.asarray(actions, np.float64)
+            if found.shape == (count,):
+                return found
+        except (TypeError, ValueError):
+            pass
+        raise UserError(
+            f"{what} of {self._name} returned {reprlib.repr(actions)}; it must return an array of "
+            f"{count} steering actions, one for each car"
+        )
+
+    def _call(self, what: str, method: Callable[[Any], Any], argument: Any) -> Any:
+        try:
+            return method(argument)
+        except Exception as error:  # a user's method may raise anything
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            raise UserError(
+                f"{what} of {self._name} failed: {_line(error)} "
+                f"({place.filename}, line {place.lineno})"
+            ) from error
 
 
 def _import(name: str) -> ModuleType:

@@ -11,11 +11,12 @@ import hashlib
 import os
 import shutil
 import stat
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -23,9 +24,10 @@ import numba
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
-import trackfeatures
-
 OWN_MODE = 0o700
+CONTAINED = {"controllers": ("simulator",)}
+"""Packages whose functions and constants a package's compiled code contains, beside those of
+trackfeatures."""
 UNUSED_DAYS = 30.0  # after this time, unused machine code of other source versions is deleted
 
 
@@ -93,10 +95,9 @@ Item = TypeVar("Item")
 def _cache_folder(package: str) -> str:
     """The folder for the machine code of a package, chosen when its first function is decorated."""
     # numba's Cache.__init__ reads the folder at decoration, so the first call would be too late.
-    sources = [Path(str(sys.modules[package].__file__)).parent]
-    # Compiled code contains functions and constants of this package.
-    sources.append(Path(trackfeatures.__file__).parent)
-    return str(code_folder("driverview", *sources))
+    names = (package, *CONTAINED.get(package, ()), "trackfeatures")
+    specs = [cast(ModuleSpec, find_spec(name)) for name in names]
+    return str(code_folder("driverview", *(Path(str(spec.origin)).parent for spec in specs)))
 
 
 def compiled(function: Function) -> Function:

@@ -28,8 +28,8 @@ def compare(config: CompareConfig, as_json: bool) -> None:
         task = bar.add_task("", total=None)
         content = run(
             config,
-            lambda done, total, name, share: bar.update(
-                task, completed=done + share, total=total, description=escape(name)
+            lambda done, total, name: bar.update(
+                task, completed=done, total=total, description=escape(name)
             ),
         )
     report = write_report(config.out, content)

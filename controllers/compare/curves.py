@@ -3,6 +3,7 @@
 import numpy as np
 
 from controllers.perception.perceived import Perceived
+from simulator.arrays import FloatArray
 from simulator.vehicle.state import CarState
 
 MAX_POINTS = 400
@@ -20,16 +21,21 @@ class CurveRecorder:
         self._rows.append((now.time_s, now.to_middle, now.angle, seen, perceived.angle))
 
     def curves(self) -> dict[str, list[float | None]]:
-        """The columns `COLUMNS`, of at most `MAX_POINTS` points; None if nothing was perceived.
+        """`curves_of` the steps so far."""
+        return curves_of(np.array(self._rows))
 
-        Each point is the step with the largest offset of its stretch, so that no peak is lost.
-        """
-        table = np.array(self._rows)
-        chosen = [
-            part[np.argmax(np.abs(table[part, 1]))]
-            for part in np.array_split(np.arange(len(table)), min(MAX_POINTS, len(table)))
-        ]
-        return {
-            name: [None if np.isnan(v) else round(float(v), 5) for v in table[chosen, column]]
-            for column, name in enumerate(COLUMNS)
-        }
+
+def curves_of(table: FloatArray) -> dict[str, list[float | None]]:
+    """The columns `COLUMNS` of the control steps (n, 5), of at most `MAX_POINTS` points; None if
+    nothing was perceived.
+
+    Each point is the step with the largest offset of its stretch, so that no peak is lost.
+    """
+    chosen = [
+        part[np.argmax(np.abs(table[part, 1]))]
+        for part in np.array_split(np.arange(len(table)), min(MAX_POINTS, len(table)))
+    ]
+    return {
+        name: [None if np.isnan(v) else round(float(v), 5) for v in table[chosen, column]]
+        for column, name in enumerate(COLUMNS)
+    }

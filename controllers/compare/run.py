@@ -1,6 +1,7 @@
 """The drives of a comparison, and the file with their results.
 
-`results.json` is {"version", "settings", "drives": [...]} and is written after each drive. A drive
+A controller with `update_batch` makes its drives on the truth at once, others are made one by one.
+`results.json` is {"version", "settings", "drives": [...]} and is written after each batch. A drive
 whose result is in the file is not driven again, unless its controller or model has changed.
 """
 
@@ -9,13 +10,15 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from controllers.compare.config import CompareConfig
-from controllers.compare.curves import CurveRecorder
+from controllers.compare.curves import CurveRecorder, curves_of
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
+from controllers.drive.many import Outcome, Task, can_join, drive_many
 from controllers.drive.run import GRID_SHARE, drive, read_parameters
 from controllers.interface import LoopConfig
 from controllers.laws.actor import WEIGHTS, is_actor
@@ -33,9 +36,13 @@ RESULTS, REPORT = "results.json", "report.html"
 SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
 """Settings that are equal for all drives of a file."""
 
-Progress = Callable[[int, int, str, float], None]
-"""A function that is called with the number of finished drives, the number of all drives, the name
-of the present drive and its finished share."""
+Progress = Callable[[float, int, str], None]
+"""A function that is called with the number of drives done, in fractions, their total number, and
+the name of the present drive or controller. Several threads call it."""
+Report = Callable[[float, str], None]
+"""`Progress` without the total number."""
+Driven = dict[str, Any] | UserError
+"""The result of a drive with its curves, or why it has none."""
 
 
 @dataclass(frozen=True)
@@ -103,60 +110,128 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
 def _drive_missing(
     config: CompareConfig, todo: list[Cell], progress: Progress | None
 ) -> dict[str, Any]:
-    """Drive the cells of `todo` without a result in the folder; write each result at once."""
+    """Drive the cells of `todo` without a result in the folder; write the results of each batch."""
     path = config.out / RESULTS
     content = read_results(path, config)
     known = {_key(entry): entry for entry in content["drives"]}
-    lost: list[str] = []
-    for done, cell in enumerate(todo):
-        report_share = _report_share(progress, done, len(todo), cell)
-        report_share(0, 1)
-        code = fingerprint(config, cell)
-        found = known.get(cell)
-        if found is None or found["code"] != code:
-            try:
-                driven = drive_cell(config, cell, report_share)
-            except ContactsUnavailable as error:
-                lost.append(f"{cell.name}: {error}")
-                continue
-            known[cell] = asdict(cell) | {"code": code} | driven
-            content["drives"] = list(known.values())
-            write_json(path, content)
+    codes = fingerprints(config, todo)
+    missing = [cell for cell in todo if known.get(cell, {}).get("code") != codes[cell]]
+    # The order of the file does not depend on which drive is done first.
+    order = list(dict.fromkeys([*known, *todo]))
+    lost: list[tuple[Cell, UserError]] = []
+
+    def report(done: float, name: str) -> None:
+        if progress is not None:
+            progress(len(todo) - len(missing) + done, len(todo), name)
+
+    for batch in drive_cells(config, missing, report):
+        for cell, driven in batch:
+            if isinstance(driven, UserError):
+                lost.append((cell, driven))
+            else:
+                known[cell] = asdict(cell) | {"code": codes[cell]} | driven
+        content["drives"] = [known[cell] for cell in order if cell in known]
+        write_json(path, content)
     if lost:
-        raise ContactsUnavailable(
+        cell, error = min(lost, key=lambda one: todo.index(one[0]))
+        raise type(error)(
             f"{len(lost)} of {len(todo)} drives have no result; the other results are in {path}, "
-            f"and the same command drives the missing ones. The first is {lost[0]}"
+            f"and the same command drives the missing ones. The first is {cell.name}: {error}"
         )
-    wanted = set(todo)
-    return content | {"drives": [entry for cell, entry in known.items() if cell in wanted]}
+    return content | {"drives": [known[cell] for cell in todo]}
 
 
-def drive_cell(
-    config: CompareConfig, cell: Cell, progress: Callable[[int, int], None] | None = None
-) -> dict[str, Any]:
-    """The result of one drive: its figures and, for seed 0, its curves."""
-    track = find_track(cell.track, config.tracks_dir)
-    start = -GRID_SHARE * track.width if config.start_d is None else config.start_d
+def drive_cells(
+    config: CompareConfig, missing: list[Cell], report: Report
+) -> Iterator[list[tuple[Cell, Driven]]]:
+    """Drive the cells; yields batches of their results.
+
+    `report` is called with the number of drives done, in fractions, and what is driven.
+    """
+    tasks = tasks_of(config, missing)
+    groups = groups_at_once(config, tasks)
+    done = 0
+    for controller, group in groups.items():
+        name = f"{controller}, {len(group)} drives at once"
+        driven = partial(_report_driven, report, done, name)
+        for outcomes in drive_many([tasks[cell] for cell in group], report=driven):
+            done += len(outcomes)
+            yield [(group[one.number], entry_of(group[one.number], one)) for one in outcomes]
+    at_once = {cell for group in groups.values() for cell in group}
+    for cell in missing:
+        if cell not in at_once:
+            share = partial(_report_share, report, done, cell.name)
+            yield [(cell, drive_cell(cell, tasks[cell], share))]
+            done += 1
+
+
+def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
+    """The configuration and the disturbance of each cell's drive."""
+    widths = {
+        name: find_track(name, config.tracks_dir).width
+        for name in dict.fromkeys(cell.track for cell in todo)
+    }
+    tuned = {
+        name: config.parameters if parameters_of(config, name) else None
+        for name in dict.fromkeys(cell.controller for cell in todo)
+    }
+    return {
+        cell: (
+            DriveConfig(
+                controller=cell.controller,
+                track=cell.track,
+                perception=cell.perception,
+                steps=config.steps,
+                start_d=(
+                    -GRID_SHARE * widths[cell.track] if config.start_d is None else config.start_d
+                ),
+                latency_ms=config.latency_ms,
+                drop=config.drop,
+                model=config.model,
+                light=config.light,
+                seed=cell.seed,
+                parameters=tuned[cell.controller],
+                tracks_dir=config.tracks_dir,
+            ),
+            DISTURBANCES[cell.disturbance],
+        )
+        for cell in todo
+    }
+
+
+def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
+    """For each controller with `update_batch` the cells that it can drive at once."""
+    groups: dict[str, list[Cell]] = {}
+    for cell, (drive_config, _) in tasks.items():
+        if can_join(drive_config):
+            groups.setdefault(cell.controller, []).append(cell)
+    made = {
+        name: make_controller(name, LoopConfig(0.05), parameters_of(config, name))
+        for name in groups
+    }
+    return {
+        name: group
+        for name, group in groups.items()
+        if callable(getattr(made[name], "update_batch", None))
+    }
+
+
+def entry_of(cell: Cell, outcome: Outcome) -> Driven:
+    """The result of one of many drives, for seed 0 with its curves."""
+    if isinstance(outcome.result, UserError):
+        return outcome.result
+    curves = {"curves": curves_of(outcome.curves)} if cell.seed == 0 else {}
+    return {"result": outcome.result.as_json()} | curves
+
+
+def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> Driven:
+    """The result of one drive alone, for seed 0 with its curves."""
     recorder = CurveRecorder()
-    result = drive(
-        DriveConfig(
-            controller=cell.controller,
-            track=cell.track,
-            perception=cell.perception,
-            steps=config.steps,
-            start_d=start,
-            latency_ms=config.latency_ms,
-            drop=config.drop,
-            model=config.model,
-            light=config.light,
-            seed=cell.seed,
-            parameters=config.parameters if parameters_of(config, cell.controller) else None,
-            tracks_dir=config.tracks_dir,
-        ),
-        progress,
-        disturbance=DISTURBANCES[cell.disturbance],
-        observers=[recorder],
-    )
+    config, disturbance = task
+    try:
+        result = drive(config, progress, disturbance=disturbance, observers=[recorder])
+    except ContactsUnavailable as error:
+        return error
     curves = {"curves": recorder.curves()} if cell.seed == 0 else {}
     return {"result": result.as_json()} | curves
 
@@ -172,19 +247,34 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
     return read_parameters(config.parameters, controller) if controller in tuned else {}
 
 
-def fingerprint(config: CompareConfig, cell: Cell) -> str:
-    """A hash of the inputs of a drive that its cell does not name: the road, the tuned parameters,
-    the user's file or trained actor, and the weights of the model or of the service's model."""
-    digest = hashlib.sha256(json.dumps(parameters_of(config, cell.controller)).encode())
-    digest.update(find_track(cell.track, config.tracks_dir).content_hash.encode())
-    file = _file_of(cell.controller)
-    if file is not None:
-        digest.update(file.read_bytes())
-    if cell.perception == "model":
-        digest.update(model_hash(config.model).encode())
-    elif cell.perception != "truth":
-        digest.update(service_model_hash(cell.perception).encode())
-    return digest.hexdigest()[:16]
+def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
+    """For each drive a hash of the inputs that its cell does not name: the tuned parameters, the
+    road, the user's file or trained actor, and the weights of the model or the service's model."""
+    tracks = {
+        name: find_track(name, config.tracks_dir).content_hash.encode()
+        for name in dict.fromkeys(cell.track for cell in todo)
+    }
+    parameters, files = {}, {}
+    for name in dict.fromkeys(cell.controller for cell in todo):
+        parameters[name] = json.dumps(parameters_of(config, name)).encode()
+        file = _file_of(name)
+        files[name] = b"" if file is None else file.read_bytes()
+    models = {
+        name: _model_of(config, name).encode()
+        for name in dict.fromkeys(cell.perception for cell in todo)
+    }
+    codes = {}
+    for cell in todo:
+        used = parameters[cell.controller], tracks[cell.track], files[cell.controller]
+        codes[cell] = hashlib.sha256(b"".join((*used, models[cell.perception]))).hexdigest()[:16]
+    return codes
+
+
+def _model_of(config: CompareConfig, perception: str) -> str:
+    """The hash of a perception's model; empty on the truth."""
+    if perception == "truth":
+        return ""
+    return model_hash(config.model) if perception == "model" else service_model_hash(perception)
 
 
 def _file_of(controller: str) -> Path | None:
@@ -236,14 +326,13 @@ def _key(entry: dict[str, Any]) -> Cell:
     return Cell(**{name: entry[name] for name in Cell.__dataclass_fields__})
 
 
-def _report_share(
-    progress: Progress | None, done: int, total: int, cell: Cell
-) -> Callable[[int, int], None]:
-    def share(step: int, steps: int) -> None:
-        if progress is not None and step % 50 == 0:
-            progress(done, total, cell.name, step / steps)
+def _report_driven(report: Report, before: int, name: str, driven: float) -> None:
+    report(before + driven, name)
 
-    return share
+
+def _report_share(report: Report, done: int, name: str, step: int, steps: int) -> None:
+    if step % 50 == 0:
+        report(done + step / steps, name)
 
 
 def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:

@@ -18,7 +18,7 @@ from controllers.compare.run import GRID_SHARE, names
 from controllers.drive.closed_loop import check_reward
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import find_disturbance
-from controllers.drive.run import drive
+from controllers.drive.many import drive_many
 from controllers.registry import CONTROLLERS
 from runtime.files import check_folder, write_json
 from simulator.track.catalogue import find_track
@@ -101,22 +101,23 @@ def propose(
 def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float]) -> float:
     """Drive `controller` with `parameters` on the tracks of `config`; returns the mean reward per
     step."""
-    rewards = []
+    tasks = []
     for name in names(config.tracks, "tracks"):
-        track = find_track(name, config.tracks_dir)
-        result = drive(
-            DriveConfig(
-                controller=controller,
-                track=name,
-                steps=config.steps,
-                start_d=-GRID_SHARE * track.width,
-                seed=config.seed,
-                tracks_dir=config.tracks_dir,
-            ),
-            disturbance=find_disturbance(config.disturbance),
-            parameters=parameters,
+        drive = DriveConfig(
+            controller=controller,
+            track=name,
+            steps=config.steps,
+            start_d=-GRID_SHARE * find_track(name, config.tracks_dir).width,
+            seed=config.seed,
+            tracks_dir=config.tracks_dir,
         )
-        rewards.append(result.per_step(config.reward))
+        tasks.append((drive, find_disturbance(config.disturbance)))
+    rewards = [0.0] * len(tasks)
+    for outcomes in drive_many(tasks, parameters):
+        for outcome in outcomes:
+            if isinstance(outcome.result, UserError):
+                raise outcome.result
+            rewards[outcome.number] = outcome.result.per_step(config.reward)
     return float(np.mean(rewards))
 
 

@@ -6,7 +6,8 @@ The throttle is held open loop, as in the paper, unless other `Pedals` are given
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from operator import attrgetter
 from typing import Any, Protocol, TextIO, TypeVar
 
 import numpy as np
@@ -16,11 +17,13 @@ from controllers.interface import Controller, Observation
 from controllers.perception.late import LOST_S
 from controllers.perception.perceived import Perceived
 from controllers.perception.real_time import RealTimeFigures
-from simulator.env.reward import OFF_TRACK_REWARD, ending, quadratic_reward, step_reward
+from runtime.jit import compiled
+from simulator.arrays import FloatArray
+from simulator.env.reward import OFF_TRACK_REWARD, Ending, ending, quadratic_reward, step_reward
 from simulator.track.road import Road
 from simulator.traffic.idm import idm_acceleration
 from simulator.traffic.traffic import Traffic
-from simulator.vehicle.state import CarState, Command
+from simulator.vehicle.state import CarState, Command, speed_of
 from trackfeatures.errors import UserError
 
 GEAR = 1
@@ -158,7 +161,8 @@ def run_lap(
     action of each step. The reward of a step is the reward of the state after it.
     """
     memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
-    totals = _Totals(start_m=world.state.odometer_m)
+    start_m, slowed_steps, ended = world.state.odometer_m, 0, None
+    rows: list[tuple[float, ...]] = []
     for _ in range(steps):
         now = world.state
         perceived = perceive(world)
@@ -169,13 +173,18 @@ def run_lap(
         lost_s = max(perceived.lost_s, memory.age / world.frequency_hz)
         if lost_s > LOST_S:
             throttle, brake = slow_down(now.vx, throttle, brake)
-            totals.slowed_steps += 1
+            slowed_steps += 1
         after = world.step(Command(steer=steer, throttle=throttle, brake=brake, gear=gear))
-        totals.add(after, steer, lane_centre, world.road)
-        if totals.ended is not None:
+        rows.append((*AFTER(after), steer))
+        ended = ending(after)
+        if ended is not None:
             break
-    run_up = round(RUN_UP_S * world.frequency_hz)
-    result = totals.result(world.state, steps, run_up, memory.blind_steps, noisy=noisy)
+    distance = world.state.odometer_m - start_m
+    driven = Driven(
+        *(np.array(rows), ended, world.state.lap, distance),
+        *(memory.blind_steps, slowed_steps, noisy),
+    )
+    result = driven.result(steps, world.road, lane_centre, world.frequency_hz)
     return replace(result, speed_error_m_s=pedals.mean_error)
 
 
@@ -235,52 +244,61 @@ def _observe(now: CarState, perceived: Perceived, memory: OffsetMemory) -> Obser
     )
 
 
+AFTER = attrgetter("to_middle", "angle", "vx", "vy")
+
+
 @dataclass
-class _Totals:
-    """Running sums of a drive; `add` is called once for each control step."""
+class Driven:
+    """The control steps that were driven, and how the drive ended."""
 
-    start_m: float
-    score: float = 0.0
-    quadratic: float = 0.0
-    ended: str | None = None
+    after: FloatArray
+    """(n, 5): to_middle, angle, vx and vy after each step, and its steering action."""
+    ended: Ending | None
+    laps_begun: int
+    distance_m: float
+    blind_steps: int
     slowed_steps: int = 0
-    in_lane_steps: int = 0
-    offsets_m: list[float] = field(default_factory=list)
-    speeds_kmh: list[float] = field(default_factory=list)
+    noisy: bool = False
 
-    def add(self, after: CarState, steer: float, lane_centre: float, road: Road) -> None:
-        self.offsets_m.append(abs(after.to_middle - lane_centre))
-        self.in_lane_steps += self.offsets_m[-1] <= road.lane_width / 2
-        self.speeds_kmh.append(after.speed_kmh)
-        self.ended = ending(after)
-        ended = self.ended is not None
-        self.score += step_reward(after.angle, after.to_middle, road.half_width, ended)
-        self.quadratic += quadratic_reward(self.offsets_m[-1], after.angle, steer, ended)
-
-    def result(
-        self, last: CarState, steps: int, run_up: int, blind_steps: int, *, noisy: bool
-    ) -> DriveResult:
-        speeds = self.speeds_kmh
-        cruising = speeds[run_up:]
-        missing = steps - len(speeds)
+    def result(self, steps: int, road: Road, lane_centre: float, frequency_hz: int) -> DriveResult:
+        """The result of a drive of which `steps` control steps were requested."""
+        driven, ended = len(self.after), self.ended is not None
+        offsets = abs(self.after[:, 0] - lane_centre)
+        score, quadratic = sum_rewards(self.after, lane_centre, road.half_width, ended)
+        speeds = [3.6 * speed_of(vx, vy) for vx, vy in self.after[:, 2:4].tolist()]
+        cruising = speeds[round(RUN_UP_S * frequency_hz) :]
         return DriveResult(
-            steps=len(speeds),
+            steps=driven,
             steps_asked=steps,
-            score=self.score,
-            score_per_step=self.score / steps,
-            quadratic_per_step=(self.quadratic + OFF_TRACK_REWARD * missing) / steps,
-            laps=max(last.lap - 1, 0),
-            distance_m=last.odometer_m - self.start_m,
-            mean_abs_d_m=float(np.mean(self.offsets_m)),
-            max_abs_d_m=max(self.offsets_m),
-            in_lane_share=self.in_lane_steps / len(speeds),
+            score=score,
+            score_per_step=score / steps,
+            quadratic_per_step=(quadratic + OFF_TRACK_REWARD * (steps - driven)) / steps,
+            laps=max(self.laps_begun - 1, 0),
+            distance_m=self.distance_m,
+            mean_abs_d_m=float(np.mean(offsets)),
+            max_abs_d_m=float(offsets.max()),
+            in_lane_share=int(np.count_nonzero(offsets <= road.lane_width / 2)) / driven,
             speed_kmh=(min(speeds), max(speeds)),
             cruising_kmh=(min(cruising), max(cruising)) if cruising else None,
-            blind_steps=blind_steps,
+            blind_steps=self.blind_steps,
             slowed_steps=self.slowed_steps,
-            noisy=noisy,
+            noisy=self.noisy,
             ended=self.ended,
         )
+
+
+@compiled
+def sum_rewards(
+    after: FloatArray, lane_centre: float, half_width: float, ended: bool
+) -> tuple[float, float]:
+    """The sums of `step_reward` and `quadratic_reward` over the steps `after` (n, 5) of `Driven`;
+    whether the last one `ended` the drive."""
+    score, quadratic = 0.0, 0.0
+    for k in range(len(after)):
+        end, angle = ended and k == len(after) - 1, after[k, 1]
+        score += step_reward(angle, after[k, 0], half_width, end)
+        quadratic += quadratic_reward(abs(after[k, 0] - lane_centre), angle, after[k, 4], end)
+    return score, quadratic
 
 
 COLUMNS = ("t", "s", "d", "th", "v", "vx", "vy", "yr", "steer", "rpm", "lap", "x", "y", "z")

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from controllers.interface import Controller, Observation
+from runtime.jit import compiled
+from simulator.arrays import FloatArray
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
@@ -19,6 +21,10 @@ from trackfeatures.errors import UserError
 OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.05, 0.005
 SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S = 0.1, 0.01
 """Standard deviations of the noise on an observation, drawn for each step."""
+NOISE_STD = np.array(
+    (OFFSET_NOISE_M, ANGLE_NOISE_RAD, SPEED_NOISE_M_S, SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S)
+)
+"""Of offset, angle, vx, vy and yaw rate."""
 DELAY_S = 0.1
 """Delay of the perception."""
 GUST_M_S, GUST_S = 6.0, 1.5
@@ -26,6 +32,7 @@ GUST_M_S, GUST_S = 6.0, 1.5
 SIDE_FORCE_M2 = 4.5
 """Side force divided by air density, wind speed and speed: the slope of the side force coefficient,
 2.3 / rad, times the frontal area."""
+AIR_DENSITY = CarParameters.air_density
 FRICTION = (0.8, 1.6)
 """Range of the tyres' friction coefficient."""
 SPREAD = 0.2
@@ -66,7 +73,7 @@ class Disturbance:
         """The world of the drive with the seed `seed`."""
         car = self.car(seed)
         if self.wind:
-            gusts = Gusts(1.0 / frequency_hz, np.random.default_rng([seed, 4]))
+            gusts = self.gusts(1.0 / frequency_hz, seed)
             return WindyWorld(road, gusts, traffic=traffic, frequency_hz=frequency_hz, car=car)
         return World(road, traffic=traffic, frequency_hz=frequency_hz, car=car)
 
@@ -74,7 +81,15 @@ class Disturbance:
         """`controller` with the sensors of the drive with the seed `seed`."""
         if not self.noise:
             return controller
-        return NoisySensors(controller, np.random.default_rng([seed, 6]))
+        return NoisySensors(controller, self.noise_rng(seed))
+
+    def gusts(self, dt: float, seed: int) -> "Gusts":
+        """The wind of the drive with the seed `seed` and control steps of `dt` s."""
+        return Gusts(dt, np.random.default_rng([seed, 4]))
+
+    def noise_rng(self, seed: int) -> np.random.Generator:
+        """Draws the standard normal numbers (5,) of each step for NOISE_STD."""
+        return np.random.default_rng([seed, 6])
 
 
 UNDISTURBED = "none"
@@ -104,15 +119,15 @@ class NoisySensors:
         self._controller, self._rng = controller, rng
 
     def update(self, observation: Observation) -> float:
-        errors = self._rng.normal(size=5).tolist()
+        errors = (NOISE_STD * self._rng.normal(size=5)).tolist()
         return self._controller.update(
             replace(
                 observation,
-                to_lane_centre=observation.to_lane_centre + OFFSET_NOISE_M * errors[0],
-                angle=observation.angle + ANGLE_NOISE_RAD * errors[1],
-                vx=observation.vx + SPEED_NOISE_M_S * errors[2],
-                vy=observation.vy + SPEED_NOISE_M_S * errors[3],
-                yaw_rate=observation.yaw_rate + YAW_RATE_NOISE_RAD_S * errors[4],
+                to_lane_centre=observation.to_lane_centre + errors[0],
+                angle=observation.angle + errors[1],
+                vx=observation.vx + errors[2],
+                vy=observation.vy + errors[3],
+                yaw_rate=observation.yaw_rate + errors[4],
             )
         )
 
@@ -142,8 +157,16 @@ class WindyWorld(World):
 
     def step(self, command: Command) -> CarState:
         now, wind = self.state, self._gusts.step()
-        force = self.car.air_density * SIDE_FORCE_M2 * wind * abs(now.vx) * 0.5
-        change = force / self.car.total_mass / self.frequency_hz
-        self._motion[7] -= change * math.sin(now.yaw)
-        self._motion[8] += change * math.cos(now.yaw)
+        push(self._motion, now.yaw, now.vx, wind, self.car.total_mass, self.frequency_hz)
         return super().step(command)
+
+
+@compiled
+def push(
+    motion: FloatArray, yaw: float, vx: float, wind: float, mass: float, frequency_hz: int
+) -> None:
+    """Add the change of speed by a side wind (m/s) over a control step to the `motion` of a car of
+    `mass` kg that drives at `vx` m/s."""
+    change = AIR_DENSITY * SIDE_FORCE_M2 * wind * abs(vx) * 0.5 / mass / frequency_hz
+    motion[7] -= change * math.sin(yaw)
+    motion[8] += change * math.cos(yaw)

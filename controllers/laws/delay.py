@@ -1,8 +1,19 @@
-"""The delay of a perception, estimated from the car's own yaw rate. SI units."""
+"""The delay of a perception, estimated from the car's own yaw rate, compiled. SI units.
+
+The estimate is the number of control steps by which the perceived heading lags behind the measured
+yaw rate. The heading error changes by theta' = r - kappa vx. Its second differences minus those of
+the integrated yaw rate contain the noise, the change of the road's curvature kappa, which is small,
+and for a wrong delay the motion of the car. Their squares are compared for the delays of 0 to
+`MAX_DELAY` steps over the last `WINDOW` steps.
+"""
+
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.jit import compiled
 from trackfeatures.errors import UserError
 
 Vector = NDArray[np.float64]
@@ -12,76 +23,108 @@ MAX_DELAY = 4
 SPANS = (1, 4)
 """Control steps over which second differences are taken: short ones are exact without noise, long
 ones contain more of the motion and no more of the noise."""
+LONGEST = max(SPANS)
 WINDOW, FEWEST = 200, 20
 """Largest and least number of control steps that are compared."""
 SURE = 3.5
 """Number of standard errors by which a delay must explain the measurements better than any
 other."""
 
+DELAY_MEMORY = np.dtype(
+    [
+        # The delay that is assumed: 0 until the measurements contradict it.
+        ("steps", np.int64),
+        # Whether it was given, or the measurements ever separated it from all others.
+        ("is_known", np.bool_),
+        ("is_given", np.bool_),
+        ("count", np.int64),
+        ("rates", np.float64, MAX_DELAY + 2),
+        # rad, integrals of the yaw rate of 0 to MAX_DELAY steps ago.
+        ("turned", np.float64, MAX_DELAY + 1),
+        ("residuals", np.float64, (2 * LONGEST + 1, MAX_DELAY + 1)),
+        ("squares", np.float64, (len(SPANS), WINDOW, MAX_DELAY + 1)),
+    ]
+)
+"""The memory of the estimate of one car."""
 
-class DelayEstimate:
-    """By how many control steps the perceived heading lags behind the measured yaw rate.
 
-    The heading error changes by theta' = r - kappa vx. Its second differences minus those of the
-    integrated yaw rate contain the noise, the change of the road's curvature kappa, which is small,
-    and for a wrong delay the motion of the car. Their squares are compared for the delays of 0 to
-    `MAX_DELAY` steps over the last `WINDOW` steps.
+def first_delays(cars: int, dt: float, known_s: float | None = None) -> NDArray[Any]:
+    """The memory (N,) of `cars` cars at the start.
 
     `known_s`: the delay, s, if it is known; then nothing is estimated. Raises UserError if it is
-    longer than `MAX_DELAY` steps.
+    longer than `MAX_DELAY` steps of `dt` s.
     """
-
-    def __init__(self, dt: float, known_s: float | None = None) -> None:
-        self._dt = dt
-        self.steps = 0 if known_s is None else round(known_s / dt)
-        """The delay that is assumed: 0 until the measurements contradict it."""
-        if not 0 <= self.steps <= MAX_DELAY:
+    memory = np.zeros(cars, DELAY_MEMORY)
+    if known_s is not None:
+        steps = round(known_s / dt)
+        if not 0 <= steps <= MAX_DELAY:
             raise UserError(
                 f"the perception's delay is {known_s:g} s; lqr-kalman and mpc-kalman take 0 to "
                 f"{MAX_DELAY * dt:g} s"
             )
-        self.is_known = known_s is not None
-        """Whether it was given, or the measurements ever separated it from all others."""
-        self._is_given = self.is_known
-        self._rates = np.zeros(MAX_DELAY + 2)
-        self._turned = np.zeros(MAX_DELAY + 1)  # rad, integrals of the yaw rate of so long ago
-        self._residuals = np.zeros((2 * max(SPANS) + 1, MAX_DELAY + 1))
-        self._squares = np.zeros((len(SPANS), WINDOW, MAX_DELAY + 1))
-        self._count = -(2 * max(SPANS) + MAX_DELAY)
+        memory["steps"], memory["is_known"], memory["is_given"] = steps, True, True
+    return memory
 
-    def update(self, theta: float, yaw_rate: float) -> bool:
-        """One control step with the perceived heading error (rad) and the yaw rate (rad/s) of now.
 
-        Returns whether `steps` changed.
-        """
-        if self._is_given:
-            return False
-        self._rates[1:] = self._rates[:-1].copy()
-        self._rates[0] = yaw_rate
-        self._turned += 0.5 * self._dt * (self._rates[1:] + self._rates[:-1])
-        self._residuals[1:] = self._residuals[:-1].copy()
-        self._residuals[0] = theta - self._turned
-        self._count += 1
-        if self._count <= 0:
-            return False
-        for squares, span in zip(self._squares, SPANS, strict=True):
-            second = self._residuals[0] - 2.0 * self._residuals[span] + self._residuals[2 * span]
-            squares[self._count % WINDOW] = second**2
-        before = self.steps
-        if self._count >= FEWEST:
-            self._decide()
-        return self.steps != before
+@compiled
+def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
+    """One control step of `dt` s with the perceived heading error (rad) and the yaw rate (rad/s) of
+    now. Returns whether the delay, `memory.steps`, changed."""
+    if memory.is_given:
+        return False
+    rates, turned, residuals = memory.rates, memory.turned, memory.residuals
+    for k in range(MAX_DELAY + 1, 0, -1):
+        rates[k] = rates[k - 1]
+    rates[0] = yaw_rate
+    for k in range(MAX_DELAY + 1):
+        for row in range(2 * LONGEST, 0, -1):
+            residuals[row, k] = residuals[row - 1, k]
+        turned[k] += 0.5 * dt * (rates[k + 1] + rates[k])
+        residuals[0, k] = theta - turned[k]
+    memory.count += 1
+    # Before that the residuals contain rates of before the first step.
+    count = memory.count - (2 * LONGEST + MAX_DELAY)
+    if count <= 0:
+        return False
+    for i in range(len(SPANS)):
+        span = SPANS[i]
+        for k in range(MAX_DELAY + 1):
+            second = residuals[0, k] - 2.0 * residuals[span, k] + residuals[2 * span, k]
+            memory.squares[i, count % WINDOW, k] = second * second
+    before = memory.steps
+    if count >= FEWEST:
+        for i in range(len(SPANS)):
+            decide(memory, memory.squares[i, : min(count, WINDOW)], SPANS[i])
+    return bool(before != memory.steps)
 
-    def _decide(self) -> None:
-        for squares, span in zip(self._squares, SPANS, strict=True):
-            compared = squares[: min(self._count, WINDOW)]
-            best = int(compared.mean(axis=0).argmin())
-            # Neighbouring second differences over several steps have measurements in common.
-            independent = len(compared) / span
-            gains = compared - compared[:, [best]]
-            error = gains.std(axis=0) / independent**0.5
-            sure = gains.mean(axis=0) > SURE * error
-            if best != self.steps and sure[self.steps]:
-                self.steps, self.is_known = best, True
-            elif best == self.steps and np.delete(sure, best).all():
-                self.is_known = True
+
+@compiled
+def decide(memory: Any, compared: Vector, span: int) -> None:
+    """Choose the delay that explains the squares `compared` (n, delays) best, if it is sure."""
+    n, best = len(compared), 0
+    sums = np.zeros(MAX_DELAY + 1)
+    for row in range(n):
+        for k in range(MAX_DELAY + 1):
+            sums[k] += compared[row, k]
+    for k in range(MAX_DELAY + 1):
+        if sums[k] / n < sums[best] / n:
+            best = k
+    # Neighbouring second differences over several steps have measurements in common.
+    independent = n / span
+    others_are_worse = True
+    for k in range(MAX_DELAY + 1):
+        if k == best:
+            continue
+        total = spread = 0.0
+        for row in range(n):
+            total += compared[row, k] - compared[row, best]
+        mean = total / n
+        for row in range(n):
+            spread += (compared[row, k] - compared[row, best] - mean) ** 2
+        sure = mean > SURE * (math.sqrt(spread / n) / math.sqrt(independent))
+        others_are_worse = others_are_worse and sure
+        if k == memory.steps and sure:
+            memory.steps, memory.is_known = best, True
+            return
+    if best == memory.steps and others_are_worse:
+        memory.is_known = True

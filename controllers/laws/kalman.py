@@ -14,20 +14,21 @@ their third differences, in which motion nearly cancels and noise does not.
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from controllers.interface import Observation
-from controllers.laws.delay import MAX_DELAY, DelayEstimate
+from controllers.interface import ANGLE, TO_LANE_CENTRE, VX, VY, YAW_RATE, Observations
+from controllers.laws.delay import MAX_DELAY, first_delays, update_delay
 from controllers.laws.lateral_model import LateralModel
 from controllers.laws.lqr_gains import FASTEST_M_S, GRID_M_S, SLOWEST_M_S
-from runtime.jit import compiled
+from runtime.jit import compiled, compiled_for_threads
 
 Vector = NDArray[np.float64]
 
-E, THETA, VY, R, KAPPA = range(5)
+E, THETA, V, R, KAPPA = range(5)
 STATES, MEASURED = 5, 4
 CAR = LateralModel(
     mass=1230.0, yaw_inertia=1120.0, front_stiffness=125_000.0, rear_stiffness=125_000.0
@@ -50,74 +51,125 @@ THIRD_DIFFERENCE = 20.0
 """Variance of a third difference of white noise: 1 + 9 + 9 + 1 times that of the noise."""
 
 
+STATE_MEMORY = np.dtype(
+    [
+        ("x", np.float64, STATES),
+        ("covariance", np.float64, (STATES, STATES)),
+        # vx, vy, yaw rate, wheel angle; newest first.
+        ("own", np.float64, (MAX_DELAY + 2, 4)),
+        ("recent", np.float64, (4, MEASURED)),
+        # Of (e, theta, vy, r), without limits.
+        ("noise_variance", np.float64, MEASURED),
+        ("steps", np.int64),
+        # The last finite e, theta, vx, vy and yaw rate.
+        ("last", np.float64, 5),
+    ]
+)
+"""The memory of the estimate of one car; zeros at the start, but for the last speed."""
+SPEED = 2
+"""Place of vx in the field `last`."""
+
+
 class StateEstimate:
-    """Estimates the state of each control step of `dt` s; `delay_s`: the delay, if it is known."""
+    """Estimates the states of cars in each control step of `dt` s; `delay_s`: the delay, if it is
+    known."""
 
     def __init__(self, dt: float, delay_s: float | None = None) -> None:
-        self.delay = DelayEstimate(dt, delay_s)
-        self.noise_variance = np.zeros(MEASURED)
-        """Of (e, theta, vy, r), without limits."""
+        self._dt, self._delay_s = dt, delay_s
         self._table = transitions(dt)
-        self._x, self._covariance = np.zeros(STATES), np.zeros((STATES, STATES))
-        self._own = np.zeros((MAX_DELAY + 2, 4))  # vx, vy, yaw rate, wheel angle; newest first
-        self._recent = np.zeros((4, MEASURED))
-        self._steps = 0
-        self._last = np.array([0.0, 0.0, SLOWEST_M_S, 0.0, 0.0])
+        self.delays = first_delays(0, dt, delay_s)
+        self.memory = np.zeros(0, STATE_MEMORY)
 
     @property
-    def speed(self) -> float:
-        """vx (m/s) of the last control step."""
-        return float(self._last[2])
+    def speeds(self) -> Vector:
+        """vx (N,) in m/s of the last control step."""
+        speeds: Vector = self.memory["last"][:, SPEED]
+        return speeds
 
-    def update(self, observation: Observation, wheel_angle: float) -> Vector:
-        """The present state (5,) from the observation of this control step.
+    def update(self, observations: Observations, wheel_angles: Vector) -> Vector:
+        """The present states (N, 5) from the observations of this control step.
 
-        `wheel_angle`: angle (rad) of the front wheels since the last control step. A measurement
-        that is not finite counts as unchanged, because otherwise it would stay in the filter.
+        `wheel_angles` (N,): angles (rad) of the front wheels since the last control step. A
+        measurement that is not finite counts as unchanged, because otherwise it would stay in the
+        filter.
         """
-        seen, own = self._measurements(observation)
-        self._own[1:] = self._own[:-1].copy()
-        self._own[0, :3], self._own[1, 3] = own, wheel_angle
-        if self._steps == 0:
-            self._own[:, :3] = own
-        changed = self.delay.update(seen[THETA], own[2])
-        if changed or self._steps == 0:
-            self._x[:VY], self._x[VY:KAPPA] = seen, self._own[self.delay.steps, 1:3]
-            self._covariance[:] = np.diag(START_STD**2)
-        self._note_noise(np.array([*seen, *own[1:]]))
-        self._steps += 1
-        share = min(max(self.speed / USUAL_M_S, SLOWEST_SHARE), 1.0)
-        return advance(
-            self._x,
-            self._covariance,
-            self._table,
-            self._own,
-            seen,
-            self.noise_variance.clip(LEAST_STD**2, MOST_STD**2),
-            (PROCESS_STD * share) ** 2,
-            self.delay.steps,
-        )
+        if len(self.memory) != len(observations):
+            self.delays = first_delays(len(observations), self._dt, self._delay_s)
+            self.memory = np.zeros(len(observations), STATE_MEMORY)
+            self.memory["last"][:, SPEED] = SLOWEST_M_S
+        rows, dt = observations.rows, self._dt
+        return estimate_states(rows, wheel_angles, self.memory, self.delays, self._table, dt)
 
-    def _measurements(self, observation: Observation) -> tuple[Vector, Vector]:
-        """Offset and heading error (2,) of the image; vx, vy and yaw rate (3,) of the car."""
-        given = np.array(
-            [
-                *(observation.to_lane_centre, -observation.angle),
-                *(observation.vx, observation.vy, observation.yaw_rate),
-            ]
-        )
-        self._last = np.where(np.isfinite(given), given, self._last)
-        return self._last[:2], self._last[2:]
 
-    def _note_noise(self, measured: Vector) -> None:
-        self._recent[1:] = self._recent[:-1].copy()
-        self._recent[0] = measured
-        if self._steps < len(self._recent) - 1:
-            return
-        newest, second, third, oldest = self._recent
-        difference = newest - 3.0 * second + 3.0 * third - oldest
-        weight = 1.0 / min(self._steps - 2, NOISE_STEPS)
-        self.noise_variance += weight * (difference**2 / THIRD_DIFFERENCE - self.noise_variance)
+@compiled_for_threads
+def estimate_states(
+    seen: Vector, wheel_angles: Vector, memory: Any, delays: Any, table: Vector, dt: float
+) -> Vector:
+    """`StateEstimate.update` for the rows of `Observations`; `memory` and `delays` are replaced."""
+    states = np.empty((len(seen), STATES))
+    for k in range(len(seen)):
+        states[k] = estimate_state(seen[k], wheel_angles[k], memory[k], delays[k], table, dt)
+    return states
+
+
+@compiled
+def estimate_state(
+    seen: Vector, wheel_angle: float, memory: Any, delay: Any, table: Vector, dt: float
+) -> Vector:
+    """The present state (5,) of one car from its observation (OBSERVED,)."""
+    own, x, last = memory.own, memory.x, memory.last
+    note_finite(0, seen[TO_LANE_CENTRE], last)
+    note_finite(1, -seen[ANGLE], last)
+    note_finite(SPEED, seen[VX], last)
+    note_finite(3, seen[VY], last)
+    note_finite(4, seen[YAW_RATE], last)
+    vx, vy, yaw_rate = last[SPEED], last[3], last[4]
+    for row in range(MAX_DELAY + 1, 0, -1):
+        for column in range(4):
+            own[row, column] = own[row - 1, column]
+    own[1, 3] = wheel_angle
+    for row in range(MAX_DELAY + 2 if memory.steps == 0 else 1):
+        own[row, 0], own[row, 1], own[row, 2] = vx, vy, yaw_rate
+    measured = np.empty(MEASURED)
+    measured[E], measured[THETA], measured[V], measured[R] = last[0], last[1], vy, yaw_rate
+    changed = update_delay(delay, measured[THETA], measured[R], dt)
+    if changed or memory.steps == 0:
+        x[E], x[THETA] = measured[E], measured[THETA]
+        x[V], x[R] = own[delay.steps, 1], own[delay.steps, 2]
+        for i in range(STATES):
+            for j in range(STATES):
+                memory.covariance[i, j] = START_STD[i] ** 2 if i == j else 0.0
+    note_noise(measured, memory)
+    memory.steps += 1
+    share = min(max(vx / USUAL_M_S, SLOWEST_SHARE), 1.0)
+    variance, process = np.empty(MEASURED), np.empty(STATES)
+    for k in range(MEASURED):
+        variance[k] = min(max(memory.noise_variance[k], LEAST_STD[k] ** 2), MOST_STD[k] ** 2)
+    for k in range(STATES):
+        process[k] = (PROCESS_STD[k] * share) ** 2
+    return advance(x, memory.covariance, table, own, measured, variance, process, delay.steps)
+
+
+@compiled
+def note_finite(place: int, value: float, last: Vector) -> None:
+    if math.isfinite(value):
+        last[place] = value
+
+
+@compiled
+def note_noise(measured: Vector, memory: Any) -> None:
+    """Update the variance of the noise by the third differences of the measurements (MEASURED,)."""
+    recent, variance = memory.recent, memory.noise_variance
+    for k in range(MEASURED):
+        for row in range(len(recent) - 1, 0, -1):
+            recent[row, k] = recent[row - 1, k]
+        recent[0, k] = measured[k]
+    if memory.steps < len(recent) - 1:
+        return
+    weight = 1.0 / min(memory.steps - 2, NOISE_STEPS)
+    for k in range(MEASURED):
+        difference = recent[0, k] - 3.0 * recent[1, k] + 3.0 * recent[2, k] - recent[3, k]
+        variance[k] += weight * (difference**2 / THIRD_DIFFERENCE - variance[k])
 
 
 @lru_cache(maxsize=8)
@@ -130,12 +182,12 @@ def transitions(dt: float, model: LateralModel = CAR) -> Vector:
 def _transition(speed: float, dt: float, model: LateralModel) -> Vector:
     lateral, wheel, turn = model.matrices(speed)
     block = np.zeros((STATES + 1, STATES + 1))
-    block[E, THETA], block[E, VY] = speed, 1.0
+    block[E, THETA], block[E, V] = speed, 1.0
     block[THETA, R], block[THETA, KAPPA] = 1.0, -speed
     # The model's rates are e' = vy + vx theta and theta': the columns of e' are those of vy.
-    block[VY, VY], block[VY, R] = lateral[1, 1], turn[1, 0]
-    block[R, VY], block[R, R] = lateral[3, 1], lateral[3, 3]
-    block[VY, STATES], block[R, STATES] = wheel[1, 0], wheel[3, 0]
+    block[V, V], block[V, R] = lateral[1, 1], turn[1, 0]
+    block[R, V], block[R, R] = lateral[3, 1], lateral[3, 3]
+    block[V, STATES], block[R, STATES] = wheel[1, 0], wheel[3, 0]
     step: Vector = expm(block * dt)[:STATES]
     return step
 
@@ -154,19 +206,19 @@ def advance(
     """One control step of the filter; returns the present state (5,).
 
     `x` (5,) and `covariance` (5, 5) are the state at the moment of the image, `delay` steps ago;
-    both are replaced. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. `seen` (2,): e
-    and theta of the image. `variance` (4,): of the measurements. `process` (5,): variance of the
+    both are replaced. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. `seen`: e
+    and theta of the image, first. `variance` (4,): of the measurements. `process` (5,): variance of the
     model's error.
     """
     predict(x, covariance, table, own[delay + 1, 0], own[delay + 1, 3], process)
-    correct(x, covariance, VY, own[delay, 1], variance[VY])
+    correct(x, covariance, V, own[delay, 1], variance[V])
     correct(x, covariance, R, own[delay, 2], variance[R])
     correct(x, covariance, THETA, seen[1], variance[THETA])
     correct(x, covariance, E, seen[0], variance[E])
     present, spread = x.copy(), covariance.copy()
     for step in range(delay - 1, -1, -1):
         predict(present, spread, table, own[step + 1, 0], own[step + 1, 3], process)
-        correct(present, spread, VY, own[step, 1], variance[VY])
+        correct(present, spread, V, own[step, 1], variance[V])
         correct(present, spread, R, own[step, 2], variance[R])
     return present
 

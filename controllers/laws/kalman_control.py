@@ -16,16 +16,29 @@ reference.
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from controllers.interface import LoopConfig, Observation
-from controllers.laws.kalman import CAR, StateEstimate
+from controllers.interface import (
+    ANGLE,
+    CURVATURE,
+    TO_LANE_CENTRE,
+    VX,
+    VY,
+    YAW_RATE,
+    LoopConfig,
+    Observation,
+    Observations,
+)
+from controllers.laws.kalman import CAR, KAPPA, THETA, E, R, StateEstimate, V
 from controllers.laws.lateral_model import Matrix
-from controllers.laws.lqr_gains import SLOWEST_M_S, LqrWeights, SpeedTable
+from controllers.laws.lqr import limited
+from controllers.laws.lqr_gains import SLOWEST_M_S, LqrWeights, SpeedTable, row_at
 from controllers.laws.mpc import Mpc, MpcWeights
 from controllers.laws.steering import STEERING_LOCK, steer_for
+from runtime.jit import compiled_for_threads
 
 APPROACH_RAD = 0.3
 """Largest heading error at which to return to the line."""
@@ -64,8 +77,8 @@ class LqrKalman:
         delay_s: float | None = None,
     ) -> None:
         self.estimate = StateEstimate(dt, delay_s)
-        self.wheel_angle = 0.0
-        """rad of the front wheels since the last control step."""
+        self.wheel_angles: Matrix = np.zeros(0)
+        """rad of the front wheels of each car since the last control step."""
         self._gains = SpeedTable(lambda speed: smooth_gain(weights, wheel_rate, speed, dt))
         self._cautious = SpeedTable(
             lambda speed: smooth_gain(WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY, speed, dt)
@@ -73,22 +86,16 @@ class LqrKalman:
         self._steady_bends = SpeedTable(CAR.cornering)
 
     def update(self, observation: Observation) -> float:
-        state = self.estimate.update(observation, self.wheel_angle)
-        offset, theta, vy, yaw_rate, curvature = state.tolist()
-        speed = max(self.estimate.speed, SLOWEST_M_S)
-        gains = self._gains if self.estimate.delay.is_known else self._cautious
-        k1, k2, k3, k4, k5 = gains(speed).tolist()
-        wheel_per_bend, theta_per_bend = self._steady_bends(speed).tolist()
-        limit = k3 * APPROACH_RAD
-        change = -(
-            max(-limit, min(k1 * offset, limit))
-            + k2 * (vy + speed * math.sin(theta))
-            + k3 * (theta - theta_per_bend * curvature)
-            + k4 * (yaw_rate - speed * curvature)
-            + k5 * (self.wheel_angle - wheel_per_bend * curvature)
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Matrix:
+        if len(self.wheel_angles) != len(observations):
+            self.wheel_angles = np.zeros(len(observations))
+        states = self.estimate.update(observations, self.wheel_angles)
+        return regulate_smoothly(
+            *(self.estimate.speeds, states, self.estimate.delays, self.wheel_angles),
+            *(self._gains.rows, self._cautious.rows, self._steady_bends.rows),
         )
-        self.wheel_angle = max(-STEERING_LOCK, min(self.wheel_angle + change, STEERING_LOCK))
-        return steer_for(self.wheel_angle)
 
 
 class MpcKalman:
@@ -105,22 +112,50 @@ class MpcKalman:
     ) -> None:
         self.estimate = StateEstimate(dt, delay_s)
         self._mpc = Mpc(dt, weights, preview=True)
-        self._steer = 0.0
+        self._steers: Matrix = np.zeros(0)
 
     def update(self, observation: Observation) -> float:
-        state = self.estimate.update(observation, self._steer * STEERING_LOCK)
-        offset, theta, vy, yaw_rate, curvature = state.tolist()
-        known = replace(
-            observation,
-            to_lane_centre=offset,
-            angle=-theta,
-            vx=self.estimate.speed,
-            vy=vy,
-            yaw_rate=yaw_rate,
-            curvature=curvature,
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Matrix:
+        if len(self._steers) != len(observations):
+            self._steers = np.zeros(len(observations))
+        states = self.estimate.update(observations, self._steers * STEERING_LOCK)
+        known = observations.rows.copy()
+        known[:, [TO_LANE_CENTRE, VY, YAW_RATE, CURVATURE]] = states[:, [E, V, R, KAPPA]]
+        known[:, ANGLE], known[:, VX] = -states[:, THETA], self.estimate.speeds
+        self._steers = self._mpc.update_batch(Observations(known))
+        return self._steers
+
+
+@compiled_for_threads
+def regulate_smoothly(
+    speeds: Matrix,
+    states: Matrix,
+    delays: Any,
+    wheel_angles: Matrix,
+    gains: Matrix,
+    cautious: Matrix,
+    steady_bends: Matrix,
+) -> Matrix:
+    """The steering actions (N,) of `LqrKalman` for cars at `speeds` (N,) with estimated `states`
+    (N, 5) and `delays` (N,). `wheel_angles` (N,) are replaced; the others are rows of tables."""
+    steers = np.empty(len(states))
+    for k in range(len(states)):
+        offset, theta, curvature = states[k, E], states[k, THETA], states[k, KAPPA]
+        speed = max(speeds[k], SLOWEST_M_S)
+        gain = row_at(gains if delays[k].is_known else cautious, speed)
+        bend = row_at(steady_bends, speed)
+        change = -(
+            limited(gain[0] * offset, gain[2] * APPROACH_RAD)
+            + gain[1] * (states[k, V] + speed * math.sin(theta))
+            + gain[2] * (theta - bend[1] * curvature)
+            + gain[3] * (states[k, R] - speed * curvature)
+            + gain[4] * (wheel_angles[k] - bend[0] * curvature)
         )
-        self._steer = self._mpc.update(known)
-        return self._steer
+        wheel_angles[k] = max(-STEERING_LOCK, min(wheel_angles[k] + change, STEERING_LOCK))
+        steers[k] = steer_for(wheel_angles[k])
+    return steers
 
 
 def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:

@@ -30,7 +30,20 @@ steer = -K x / 21. The regulator's angle is in rad but 21 is the lock in degrees
 import math
 from dataclasses import replace
 
-from controllers.interface import LoopConfig, Observation
+import numpy as np
+
+from controllers.interface import (
+    ANGLE,
+    CURVATURE,
+    HEADING,
+    TO_LANE_CENTRE,
+    VX,
+    VY,
+    YAW_RATE,
+    LoopConfig,
+    Observation,
+    Observations,
+)
 from controllers.laws.lateral_model import LateralModel, Matrix
 from controllers.laws.lqr_gains import (
     SLOWEST_M_S,
@@ -38,9 +51,11 @@ from controllers.laws.lqr_gains import (
     SpeedTable,
     continuous_gains,
     discrete_gains,
+    row_at,
 )
 from controllers.laws.steering import steer_for
-from controllers.perception.curvature import CurvatureEstimate
+from controllers.perception.curvature import next_curvature
+from runtime.jit import compiled, compiled_for_threads
 
 WEIGHTS_PAPER = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
 """The paper's weights for forza and g-track-3 (second rows of its table)."""
@@ -58,6 +73,8 @@ APPROACH_RAD = 0.15
 UNLIMITED_RAD = 1e6
 """The value of `approach_rad` that sets no limit, for the exact state."""
 LOCK_DEG = 21.0
+RATE = 3
+"""Size of the memory of a rate: whether there was a value, the last value, the rate."""
 
 
 def make_lqr(loop: LoopConfig, **weights: float) -> "Lqr":
@@ -101,25 +118,23 @@ class Lqr:
     ) -> None:
         self.dt, self.weights, self.model = dt, weights, model or LateralModel()
         self._gains = discrete_gains(self.model, weights, dt)
-        self._heading_rate = RateEstimate(dt, rate_filter_s)
+        self._blend = blend_for(dt, rate_filter_s)
         self._approach_rad = approach_rad
+        self._rates = np.zeros((0, RATE))
 
     def gain(self, speed: float) -> Matrix:
         """K (4,) at `speed` m/s."""
         return self._gains(speed)
 
     def update(self, observation: Observation) -> float:
-        theta = -observation.angle
-        k1, k2, k3, k4 = self._gains(observation.vx).tolist()
-        # The yaw rate alone is not e2', because the road turns in a bend.
-        # At the limit the terms of the offset and of the heading are equal.
-        return steer_for(
-            -(
-                _limited(k1 * observation.to_lane_centre, k3 * self._approach_rad)
-                + k2 * (observation.vy + observation.vx * math.sin(theta))
-                + k3 * theta
-                + k4 * self._heading_rate(theta)
-            )
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Matrix:
+        if len(self._rates) != len(observations):
+            self._rates = np.zeros((len(observations), RATE))
+        return regulate(
+            *(observations.rows, self._gains.rows, self._rates),
+            *(self.dt, self._blend, self._approach_rad),
         )
 
 
@@ -138,27 +153,23 @@ class LqrPreview:
         self.dt, self.weights, self.model = dt, weights, model or LateralModel()
         self._gains = discrete_gains(self.model, weights, dt)
         self._steady_bends = SpeedTable(self.model.cornering)
-        self._estimate = CurvatureEstimate(dt, curvature_filter_s)
+        self._filter_s = curvature_filter_s
         self._approach_rad = approach_rad
+        self._curvatures = np.zeros(0)
 
     def gain(self, speed: float) -> Matrix:
         """K (4,) at `speed` m/s."""
         return self._gains(speed)
 
     def update(self, observation: Observation) -> float:
-        speed = max(observation.vx, SLOWEST_M_S)
-        curvature = observation.curvature
-        if curvature is None:
-            curvature = self._estimate(observation)
-        theta = -observation.angle
-        wheel_per_bend, theta_per_bend = self._steady_bends(speed).tolist()
-        k1, k2, k3, k4 = self._gains(speed).tolist()
-        return steer_for(
-            wheel_per_bend * curvature
-            - _limited(k1 * observation.to_lane_centre, k3 * self._approach_rad)
-            - k2 * (observation.vy + observation.vx * math.sin(theta))
-            - k3 * (theta - theta_per_bend * curvature)
-            - k4 * (observation.yaw_rate - observation.vx * curvature)
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Matrix:
+        if len(self._curvatures) != len(observations):
+            self._curvatures = np.zeros(len(observations))
+        return regulate_with_preview(
+            *(observations.rows, self._gains.rows, self._steady_bends.rows, self._curvatures),
+            *(self.dt, self._filter_s, self._approach_rad),
         )
 
 
@@ -171,34 +182,107 @@ class LqrPaper:
         weights: LqrWeights = WEIGHTS_PAPER,
         model: LateralModel | None = None,
     ) -> None:
-        self.weights, self.model = weights, model or LateralModel()
+        self.dt, self.weights, self.model = dt, weights, model or LateralModel()
         self._gains = continuous_gains(self.model, weights)
-        self._offset_rate, self._heading_rate = RateEstimate(dt), RateEstimate(dt)
+        self._rates = np.zeros((0, 2, RATE))
 
     def update(self, observation: Observation) -> float:
-        offset, theta = observation.to_lane_centre, -observation.angle
-        k1, k2, k3, k4 = self._gains(observation.vx).tolist()
-        demand = k1 * offset + k2 * self._offset_rate(offset)
-        demand += k3 * theta + k4 * self._heading_rate(theta)
-        return float(max(-1.0, min(-demand / LOCK_DEG, 1.0)))
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Matrix:
+        if len(self._rates) != len(observations):
+            self._rates = np.zeros((len(observations), 2, RATE))
+        return regulate_as_released(observations.rows, self._gains.rows, self._rates, self.dt)
 
 
-def _limited(value: float, limit: float) -> float:
+# The compiled laws: `seen` are the rows of `Observations` (N, OBSERVED), `gains` those of a
+# `SpeedTable`. They return the steering actions (N,).
+
+
+@compiled_for_threads
+def regulate(
+    seen: Matrix, gains: Matrix, rates: Matrix, dt: float, blend: float, approach_rad: float
+) -> Matrix:
+    """`Lqr`; `rates` (N, RATE): memory of the rate of the heading error, replaced."""
+    steers = np.empty(len(seen))
+    for k in range(len(seen)):
+        vx, theta = seen[k, VX], -seen[k, ANGLE]
+        gain = row_at(gains, vx)
+        # The yaw rate alone is not e2', because the road turns in a bend.
+        # At the limit the terms of the offset and of the heading are equal.
+        steers[k] = steer_for(
+            -(
+                limited(gain[0] * seen[k, TO_LANE_CENTRE], gain[2] * approach_rad)
+                + gain[1] * (seen[k, VY] + vx * math.sin(theta))
+                + gain[2] * theta
+                + gain[3] * next_rate(rates[k], theta, dt, blend)
+            )
+        )
+    return steers
+
+
+@compiled_for_threads
+def regulate_with_preview(
+    seen: Matrix,
+    gains: Matrix,
+    steady_bends: Matrix,
+    curvatures: Matrix,
+    dt: float,
+    filter_s: float,
+    approach_rad: float,
+) -> Matrix:
+    """`LqrPreview`; `curvatures` (N,): estimates where no curvature is measured, replaced."""
+    steers = np.empty(len(seen))
+    for k in range(len(seen)):
+        vx, theta, yaw_rate = seen[k, VX], -seen[k, ANGLE], seen[k, YAW_RATE]
+        curvature = seen[k, CURVATURE]
+        if math.isnan(curvature):
+            curvatures[k] = next_curvature(
+                curvatures[k], yaw_rate, vx, seen[k, HEADING], dt, filter_s
+            )
+            curvature = curvatures[k]
+        speed = max(vx, SLOWEST_M_S)
+        bend, gain = row_at(steady_bends, speed), row_at(gains, speed)
+        steers[k] = steer_for(
+            bend[0] * curvature
+            - limited(gain[0] * seen[k, TO_LANE_CENTRE], gain[2] * approach_rad)
+            - gain[1] * (seen[k, VY] + vx * math.sin(theta))
+            - gain[2] * (theta - bend[1] * curvature)
+            - gain[3] * (yaw_rate - vx * curvature)
+        )
+    return steers
+
+
+@compiled_for_threads
+def regulate_as_released(seen: Matrix, gains: Matrix, rates: Matrix, dt: float) -> Matrix:
+    """`LqrPaper`; `rates` (N, 2, RATE): memory of the rates of offset and heading, replaced."""
+    steers = np.empty(len(seen))
+    for k in range(len(seen)):
+        offset, theta = seen[k, TO_LANE_CENTRE], -seen[k, ANGLE]
+        gain = row_at(gains, seen[k, VX])
+        demand = gain[0] * offset + gain[1] * next_rate(rates[k, 0], offset, dt, 1.0)
+        demand += gain[2] * theta + gain[3] * next_rate(rates[k, 1], theta, dt, 1.0)
+        steers[k] = max(-1.0, min(-demand / LOCK_DEG, 1.0))
+    return steers
+
+
+@compiled
+def limited(value: float, limit: float) -> float:
     return max(-limit, min(value, limit))
 
 
-class RateEstimate:
-    """The rate of a quantity from its differences over a control step, low-pass filtered."""
+def blend_for(dt: float, filter_s: float) -> float:
+    """The factor of a low-pass filter with the time constant `filter_s` on a rate."""
+    return dt / (dt + filter_s)
 
-    def __init__(self, dt: float, filter_s: float = 0.0) -> None:
-        self._dt = dt
-        self._blend = dt / (dt + filter_s)
-        self._last: float | None = None
-        self._rate = 0.0
 
-    def __call__(self, value: float) -> float:
-        """The rate now; 0 at the first call."""
-        if self._last is not None:
-            self._rate += self._blend * ((value - self._last) / self._dt - self._rate)
-        self._last = value
-        return self._rate
+@compiled
+def next_rate(memory: Matrix, value: float, dt: float, blend: float) -> float:
+    """The rate of `value` from its difference over a control step, low-pass filtered; 0 at first.
+
+    `memory` (RATE,) is replaced.
+    """
+    if memory[0] != 0.0:
+        memory[2] += blend * ((value - memory[1]) / dt - memory[2])
+    memory[0], memory[1] = 1.0, value
+    return float(memory[2])

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_are, solve_discrete_are
 
 from controllers.laws.lateral_model import LateralModel, Matrix
+from runtime.jit import compiled
 
 SLOWEST_M_S, FASTEST_M_S, GRID_M_S = 3.0, 45.0, 2.0
 """The grid of speeds. The model divides by the speed, so the gains are constant below the grid."""
@@ -63,17 +64,23 @@ def continuous_gain(model: LateralModel, weights: LqrWeights, speed: float) -> M
 class SpeedTable:
     """Rows computed at a grid of speeds, interpolated linearly, constant outside the grid."""
 
-    def __init__(self, row_at: Callable[[float], Matrix | tuple[float, ...]]) -> None:
+    def __init__(self, compute: Callable[[float], Matrix | tuple[float, ...]]) -> None:
         speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
-        self._rows = np.array([row_at(float(speed)) for speed in speeds])
+        self.rows: Matrix = np.array([compute(float(speed)) for speed in speeds])
 
     def __call__(self, speed: float) -> Matrix:
         """The row (n,) at `speed` m/s."""
-        place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
-        low = min(int(place), len(self._rows) - 2)
-        share = place - low
-        row: Matrix = (1.0 - share) * self._rows[low] + share * self._rows[low + 1]
-        return row
+        return row_at(self.rows, speed)
+
+
+@compiled
+def row_at(rows: Matrix, speed: float) -> Matrix:
+    """The row (n,) at `speed` m/s of the `rows` (speeds, n) of a `SpeedTable`."""
+    place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
+    low = min(int(place), len(rows) - 2)
+    share = place - low
+    row: Matrix = (1.0 - share) * rows[low] + share * rows[low + 1]
+    return row
 
 
 @lru_cache(maxsize=64)

@@ -27,10 +27,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.interface import LoopConfig, Observation
+from controllers.interface import (
+    ANGLE,
+    CURVATURE,
+    HEADING,
+    OBSERVED,
+    TO_LANE_CENTRE,
+    VX,
+    YAW_RATE,
+    LoopConfig,
+    Observation,
+    Observations,
+)
 from controllers.laws.steering import STEERING_LOCK, steer_for
-from controllers.perception.curvature import CurvatureEstimate
-from runtime.jit import compiled
+from controllers.perception.curvature import next_curvature
+from runtime.jit import compiled, compiled_for_threads
 from simulator.vehicle.car import CarParameters
 
 Vector = NDArray[np.float64]
@@ -38,6 +49,7 @@ Vector = NDArray[np.float64]
 HORIZON = 10
 """Control steps; the paper compares 8, 10 and 12."""
 REAR_AXLE_M, WHEELBASE_M = CarParameters.rear_axle, CarParameters().wheelbase
+CURVATURE_FILTER_S = 0.4
 MAX_ITERATIONS = 30
 TOLERANCE = 1e-10
 """Relative decrease of the cost at which the solver stops."""
@@ -84,30 +96,48 @@ class Mpc:
         horizon: int = HORIZON,
         preview: bool = False,
     ) -> None:
-        self.dt, self.weights, self.horizon = dt, weights, horizon
-        self.wheel_angles: Vector = np.zeros(horizon)
-        """The planned front wheel angles (rad), one for each step of the horizon."""
+        self.dt, self.weights, self.horizon, self.preview = dt, weights, horizon, preview
+        self.plans: Vector = np.zeros((0, horizon))
+        """Of each car the planned front wheel angles (rad), for each step of the horizon."""
         self._cost = np.array([weights.offset, weights.heading, weights.wheel])
-        self._estimate = CurvatureEstimate(dt) if preview else None
-        solve(self.wheel_angles, 0.0, 0.0, 10.0, dt, 0.0, self._cost)  # compiles
+        self._curvatures = np.zeros(0)
+        self.update_batch(Observations(np.zeros((0, OBSERVED))))  # compiles
 
     def update(self, observation: Observation) -> float:
-        curvature = 0.0
-        if self._estimate is not None:
-            known = observation.curvature
-            curvature = self._estimate(observation) if known is None else known
-        self.wheel_angles[:-1] = self.wheel_angles[1:]
-        speed = max(observation.vx, 0.0)
-        solve(
-            self.wheel_angles,
-            observation.to_lane_centre,
-            -observation.angle,
-            speed,
-            self.dt,
-            curvature,
-            self._cost,
-        )
-        return steer_for(float(self.wheel_angles[0]))
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Vector:
+        if len(self.plans) != len(observations):
+            self.plans = np.zeros((len(observations), self.horizon))
+            self._curvatures = np.zeros(len(observations))
+        rows, curvatures = observations.rows, self._curvatures
+        return plan_cars(rows, self.plans, curvatures, self.preview, self.dt, self._cost)
+
+
+@compiled_for_threads
+def plan_cars(
+    seen: Vector, plans: Vector, curvatures: Vector, preview: bool, dt: float, cost: Vector
+) -> Vector:
+    """The steering actions (N,) for the rows of `Observations` (N, OBSERVED).
+
+    Replaced are the `plans` (N, n) and, where no curvature is measured, its estimates `curvatures`
+    (N,). Without `preview` the curvature of the reference is 0.
+    """
+    steers = np.empty(len(seen))
+    for k in range(len(seen)):
+        vx, plan, curvature = seen[k, VX], plans[k], 0.0
+        if preview:
+            curvature = seen[k, CURVATURE]
+            if math.isnan(curvature):
+                before, yaw_rate, road = curvatures[k], seen[k, YAW_RATE], seen[k, HEADING]
+                curvatures[k] = next_curvature(before, yaw_rate, vx, road, dt, CURVATURE_FILTER_S)
+                curvature = curvatures[k]
+        for step in range(len(plan) - 1):
+            plan[step] = plan[step + 1]
+        offset, heading, speed = seen[k, TO_LANE_CENTRE], -seen[k, ANGLE], max(vx, 0.0)
+        solve(plan, offset, heading, speed, dt, curvature, cost)
+        steers[k] = steer_for(plan[0])
+    return steers
 
 
 @compiled

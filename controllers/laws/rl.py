@@ -4,7 +4,10 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from controllers.interface import LoopConfig, Observation
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.interface import LoopConfig, Observation, Observations
 from controllers.laws.actor import Actor, load_actor
 from controllers.laws.actor_state import EXACT, STEP_S, StateBuilder, paper_state
 from trackfeatures.errors import UserError
@@ -19,7 +22,9 @@ class RlController:
     """Steers by the actions of `actor`, without noise."""
 
     def __init__(self, actor: Actor, loop: LoopConfig = EXACT) -> None:
-        self._actor = actor
+        self._actor, self._loop = actor, loop
+        self._cars: list[RlController] = []
+        """The controllers of the cars of `update_batch`."""
         self._states = StateBuilder(actor.definition, loop)
         self._farthest_m = FARTHEST_M if loop.noisy else math.inf
 
@@ -29,6 +34,13 @@ class RlController:
             observation = replace(observation, to_lane_centre=offset)
         paper = paper_state(observation, self._actor.card.half_width_m)
         return self._states.steer(self._actor.steer(self._states.build(paper, observation)))
+
+    def update_batch(self, observations: Observations) -> NDArray[np.float64]:
+        # Car by car: a product of matrices has other last bits for each number of cars.
+        if len(self._cars) != len(observations):
+            self._cars = [RlController(self._actor, self._loop) for _ in range(len(observations))]
+        pairs = zip(self._cars, observations.split(), strict=True)
+        return np.array([car.update(observation) for car, observation in pairs])
 
 
 def load_controller(folder: Path, loop: LoopConfig = EXACT) -> RlController:

@@ -1,11 +1,13 @@
 """The steering action of a front wheel angle; left is positive in both."""
 
+from runtime.jit import callable_from_compiled
 from simulator.vehicle.car import CarParameters
 
 STEERING_LOCK = CarParameters.steering_lock
 """Angle (rad) of the front wheels at the steering action 1."""
 
 
+@callable_from_compiled
 def steer_for(wheel_angle: float, lock: float = STEERING_LOCK) -> float:
     """The steering action in [-1, 1] for a front wheel angle (rad)."""
     return max(-1.0, min(1.0, wheel_angle / lock))

@@ -9,8 +9,21 @@ simulator must drive the same laps as TORCS.
 import math
 from dataclasses import dataclass
 
-from controllers.interface import LoopConfig, Observation
+import numpy as np
+
+from controllers.interface import (
+    ANGLE,
+    TO_LANE_CENTRE,
+    VX,
+    VY,
+    YAW_RATE,
+    LoopConfig,
+    Observation,
+    Observations,
+)
+from controllers.laws.lateral_model import Matrix
 from controllers.laws.steering import steer_for
+from runtime.jit import compiled_for_threads
 
 
 def make_torcs(loop: LoopConfig) -> "StateFeedback":
@@ -28,13 +41,27 @@ class StateFeedback:
     yaw_rate: float = 0.1
 
     def update(self, observation: Observation) -> float:
-        theta = -observation.angle
-        rate = observation.vy + observation.vx * math.sin(theta)
-        return steer_for(
+        return float(self.update_batch(Observations.of(observation))[0])
+
+    def update_batch(self, observations: Observations) -> Matrix:
+        gains = (self.offset, self.offset_rate, self.heading, self.yaw_rate)
+        return feed_back(observations.rows, gains)
+
+
+@compiled_for_threads
+def feed_back(seen: Matrix, gains: tuple[float, float, float, float]) -> Matrix:
+    """The steering actions (N,) for the rows of `Observations` (N, OBSERVED)."""
+    steers = np.empty(len(seen))
+    offset, offset_rate, heading, yaw_rate = gains
+    for k in range(len(seen)):
+        theta = -seen[k, ANGLE]
+        rate = seen[k, VY] + seen[k, VX] * math.sin(theta)
+        steers[k] = steer_for(
             -(
-                self.offset * observation.to_lane_centre
-                + self.offset_rate * rate
-                + self.heading * theta
-                + self.yaw_rate * observation.yaw_rate
+                offset * seen[k, TO_LANE_CENTRE]
+                + offset_rate * rate
+                + heading * theta
+                + yaw_rate * seen[k, YAW_RATE]
             )
         )
+    return steers

@@ -3,15 +3,32 @@
 from dataclasses import dataclass
 
 from controllers.interface import Observation
+from runtime.jit import callable_from_compiled
 from trackfeatures import RoadClass
 
 SLOWEST_M_S = 3.0
 """Lower bound of the speed that divides the yaw rate."""
+LEFT, RIGHT = int(RoadClass.LEFT), int(RoadClass.RIGHT)
+
+
+@callable_from_compiled
+def next_curvature(
+    value: float, yaw_rate: float, vx: float, heading: float, dt: float, filter_s: float
+) -> float:
+    """The estimate after a control step, from the estimate `value` before it (1/m, left positive):
+    yaw rate over speed, low-pass filtered. Its sign does not contradict the class of the road."""
+    turning = yaw_rate / max(vx, SLOWEST_M_S)
+    value += dt / (dt + filter_s) * (turning - value)
+    if heading == LEFT:
+        value = max(value, 0.0)
+    elif heading == RIGHT:
+        value = min(value, 0.0)
+    return value
 
 
 @dataclass
 class CurvatureEstimate:
-    """The road's curvature (1/m, left positive): yaw rate over speed, low-pass filtered.
+    """The road's curvature (1/m, left positive), estimated by `next_curvature`.
 
     `dt` is the control step and `filter_s` the time constant of the filter, both in s.
     """
@@ -21,11 +38,7 @@ class CurvatureEstimate:
     value: float = 0.0
 
     def __call__(self, observation: Observation) -> float:
-        """The estimate after this step; its sign does not contradict the class of the road."""
-        turning = observation.yaw_rate / max(observation.vx, SLOWEST_M_S)
-        self.value += self.dt / (self.dt + self.filter_s) * (turning - self.value)
-        if observation.heading is RoadClass.LEFT:
-            self.value = max(self.value, 0.0)
-        elif observation.heading is RoadClass.RIGHT:
-            self.value = min(self.value, 0.0)
+        """The estimate after this step."""
+        yaw_rate, vx, heading = observation.yaw_rate, observation.vx, observation.heading
+        self.value = next_curvature(self.value, yaw_rate, vx, heading, self.dt, self.filter_s)
         return self.value

@@ -145,6 +145,14 @@ def check_drop(drop: float) -> None:
         raise UserError(f"a share of {drop} lost answers; give 0 or more, below 1")
 
 
+def delay_steps(latency_s: float, dt: float) -> int:
+    """The control steps of `dt` s by which answers are late, rounded up. Raises UserError for a
+    latency out of range."""
+    if not 0.0 <= latency_s <= LOST_S:
+        raise UserError(f"a latency of {1000 * latency_s:g} ms; give 0 to 1000 ms")
+    return math.ceil(latency_s / dt - 1e-9)
+
+
 class LatePerception(Generic[World]):
     """A perception whose answers arrive `latency_s` late; a share `drop` of them is lost.
 
@@ -164,11 +172,9 @@ class LatePerception(Generic[World]):
         rng: np.random.Generator,
         predict: bool = True,
     ) -> None:
-        if not 0.0 <= latency_s <= LOST_S:
-            raise UserError(f"a latency of {1000 * latency_s:g} ms; give 0 to 1000 ms")
         check_drop(drop)
         self._perceive, self._state = perceive, state
-        self._delay = math.ceil(latency_s / dt - 1e-9)
+        self._delay = delay_steps(latency_s, dt)
         self._drop, self._rng = drop, rng
         self._estimate = RoadEstimate(dt, latency_s, predict=predict)
         self._under_way: deque[Perceived | None] = deque()

@@ -126,17 +126,24 @@ def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, firs
     if first:
         result[REWARD] = result[ENDED] = result[SCORE] = 0.0
         return
-    ended = ending_code(
-        abs(offset) > road[EDGE],
-        abs(angle) > 0.5 * math.pi or track[TRACK_SPEED] < BACKWARDS_SPEED_M_S,
-        car[TOUCHED] == WALL,
-        car[TOUCHED] != 0.0,
-        ends,
-    )
+    ended = ending_of(car, road, ends)
     result[ENDED] = ended
     if rewarded:
         result[REWARD] = step_reward(angle, offset, road[HALF_WIDTH], ended > 0, weight)
         result[SCORE] += result[REWARD]
+
+
+@compiled
+def ending_of(car: FloatArray, road: FloatArray, ends: int) -> int:
+    """`ending_code` of a car's row on the row of its road."""
+    track = car[TRACK_AT:]
+    return ending_code(
+        abs(track[TRACK_OFFSET]) > road[EDGE],
+        abs(track[ANGLE]) > 0.5 * math.pi or track[TRACK_SPEED] < BACKWARDS_SPEED_M_S,
+        car[TOUCHED] == WALL,
+        car[TOUCHED] != 0.0,
+        ends,
+    )
 
 
 @compiled

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from runtime.jit import compiled
+from runtime.jit import callable_from_compiled, compiled
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState
@@ -22,6 +22,7 @@ Ending = Literal["off_track", "backwards", "collision"]
 
 ENDINGS: tuple[Ending, ...] = get_args(Ending)
 OFF_TRACK_REWARD = -2.0
+STEERING_LOCK = CarParameters.steering_lock
 
 Reward = Callable[[CarState, Road, Ending | None], float]
 """Reward function of (state after the step, road, why the episode ends or None)."""
@@ -80,6 +81,7 @@ def step_reward(
     return math.cos(angle) - weight * abs(math.sin(angle)) - abs(to_middle) / half_width
 
 
+@callable_from_compiled
 def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> float:
     """-(0.3 offset^2 + angle^2 + 0.03 delta^2), or -2 when the episode ends.
 
@@ -88,7 +90,7 @@ def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> 
     """
     if ended:
         return OFF_TRACK_REWARD
-    delta = steer * CarParameters.steering_lock
+    delta = steer * STEERING_LOCK
     return -(0.3 * offset * offset + angle * angle + 0.03 * delta * delta)
 
 

@@ -63,9 +63,15 @@ class CarState:
     @property
     def speed(self) -> float:
         """m/s in the road plane; negative when the car rolls back."""
-        planar = math.hypot(self.vx, self.vy)
-        return planar if self.vx >= 0.0 else -planar
+        return speed_of(self.vx, self.vy)
 
     @property
     def speed_kmh(self) -> float:
         return 3.6 * self.speed
+
+
+def speed_of(vx: float, vy: float) -> float:
+    """The speed (m/s) in the road plane; negative when the car rolls back."""
+    # Compiled code and numpy have a hypot with other last bits.
+    planar = math.hypot(vx, vy)
+    return planar if vx >= 0.0 else -planar

@@ -12,6 +12,8 @@ import gymnasium as gym
 import pytest
 
 import simulator.env  # noqa: F401  # registers the environments
+from controllers.compare.config import CompareConfig
+from controllers.compare.run import compare
 from controllers.rl.config import TrainConfig
 from controllers.rl.run_folder import stored_config
 from controllers.rl.training import train as train_actor
@@ -65,6 +67,14 @@ def _(folder: Path) -> object:
     turns = Turns(mock.Mock(), (1, 2, 2, 3), free=lambda: None)
     with mock.patch("os.getpid", return_value=0), turns:  # as a forked child finds it
         return None
+
+
+@add_to(TRIES, "steering of a controller's `update_batch` that is no number in [-1, 1]")
+def _(folder: Path) -> object:
+    law = "class Law:\n    def update(self, seen): ...\n    def update_batch(self, seen):\n"
+    path = written(folder, "law.py", f"{law}        return [float('nan')]\n".encode())
+    config = CompareConfig(folder / "out", tracks="oval", controllers=f"{path}:Law", steps=1)
+    return compare(config)
 
 
 @add_to(TRIES, "a bad action of one of many cars")

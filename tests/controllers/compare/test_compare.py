@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ import controllers.compare.run as comparison
 from controllers.compare.config import CompareConfig, TuneConfig
 from controllers.compare.curves import CurveRecorder
 from controllers.compare.report import driving_curves, score_table, spread, write_report
-from controllers.compare.run import Cell, cells, compare, fingerprint
-from controllers.compare.tune import propose, tune
-from controllers.drive.run import read_parameters
+from controllers.compare.run import Cell, cells, compare, fingerprints
+from controllers.compare.tune import evaluate, propose, tune
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import DISTURBANCES
+from controllers.drive.run import drive, read_parameters
 from controllers.laws.actor import WEIGHTS, load_actor
 from controllers.laws.rl import SHIPPED
 from controllers.perception.perceived import Perceived
@@ -35,6 +38,32 @@ class Law:
     def update(self, observation):
         return max(-1.0, min(2 * observation.angle - {gain} * observation.to_lane_centre, 1.0))
 """
+BATCH_LAW = """
+import numpy as np
+
+class Single:
+    def update(self, seen):
+        return max(-1.0, min(2 * seen.angle - 0.2 * seen.to_lane_centre, 1.0))
+
+class Batch:
+    def update(self, seen):
+        raise RuntimeError("not called")
+    def update_batch(self, seen):
+        return np.clip(2 * seen.angle - 0.2 * seen.to_lane_centre, -1.0, 1.0)
+
+class Broken(Batch):
+    calls = 0
+    def update_batch(self, seen):
+        steers = super().update_batch(seen)
+        self.calls += 1
+        if self.calls > 30 and len(seen) == 3:
+            steers[1] = np.nan
+        return steers
+"""
+BROKEN = (
+    "1 of 3 drives have no result.*The first is {}/law.py:Broken on oval, truth, seed 1: "
+    "update_batch returned nan for this car in control step 30; it must return"
+)
 
 
 def short(folder: Path, **changes: Any) -> CompareConfig:
@@ -42,19 +71,21 @@ def short(folder: Path, **changes: Any) -> CompareConfig:
 
 
 class Counter:
-    """Stores the cells that are driven."""
+    """Stores the cells that are driven; batches have one cell."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> None:
         self.cells: list[Cell] = []
-        real = comparison.drive_cell
+        real = comparison.drive_cells
 
-        def counted(config: CompareConfig, cell: Cell, progress: Any = None) -> dict[str, Any]:
-            if len(self.cells) == stop_after:
-                raise KeyboardInterrupt
-            self.cells.append(cell)
-            return real(config, cell, progress)
+        def counted(*arguments: Any) -> Iterator[list[tuple[Cell, comparison.Driven]]]:
+            for batch in real(*arguments):
+                if len(self.cells) == stop_after:
+                    raise KeyboardInterrupt
+                self.cells += [cell for cell, _ in batch]
+                yield batch
 
-        monkeypatch.setattr(comparison, "drive_cell", counted)
+        monkeypatch.setattr("controllers.drive.many.CARS", 1)
+        monkeypatch.setattr(comparison, "drive_cells", counted)
 
 
 def test_every_controller_drives_every_track_with_every_seed_and_disturbance() -> None:
@@ -80,9 +111,9 @@ def test_an_interrupted_comparison_is_continued_and_drives_nothing_twice(
     assert len(kept["drives"]) == 3
     second = Counter(monkeypatch)
     content = compare(config)
-    assert [cell.name for cell in second.cells] == ["torcs on town, truth, seed 0"]
-    assert len(content["drives"]) == 4
-    assert content["drives"][:3] == kept["drives"]
+    assert [set(second.cells), len(content["drives"])] == [{*cells(config)} - {*first.cells}, 4]
+    assert second.cells[0].controller == "torcs"
+    assert all(drive in content["drives"] for drive in kept["drives"])
     compare(config)
     assert len(second.cells) == 1
     # The file keeps all controllers; the returned content has only the requested ones.
@@ -135,7 +166,7 @@ def test_a_drive_on_a_model_depends_on_its_weights(
     for weights in ("one", "other"):
         monkeypatch.setattr(comparison, "model_hash", lambda run, weights=weights: weights)
         monkeypatch.setattr(comparison, "service_model_hash", lambda url, weights=weights: weights)
-        codes.append([fingerprint(config, cell) for cell in cells(config)])
+        codes.append(list(fingerprints(config, cells(config)).values()))
     assert codes[0][0] == codes[1][0]
     assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3
     assert codes[0][2] != codes[1][2]
@@ -148,7 +179,7 @@ def test_a_drive_on_a_track_that_has_changed_is_driven_again(tmp_path: Path) -> 
     for name in ("oval", "town"):
         shutil.copy(OWN_TRACKS / f"{name}.toml", tracks / "mine.toml")
         config = short(tmp_path, tracks=str(tracks / "mine.toml"), controllers="lqr")
-        codes |= {fingerprint(config, cell) for cell in cells(config)}
+        codes |= {*fingerprints(config, cells(config)).values()}
     assert len(codes) == 2
 
 
@@ -263,6 +294,35 @@ def test_the_commands_print_json_and_tables(tmp_path: Path) -> None:
     assert "lqr: 0." in done.stdout
 
 
+def test_a_users_controller_is_driven_in_a_batch_with_the_numbers_of_single_drives(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "law.py").write_text(BATCH_LAW)
+    options = {"tracks": "oval,town", "seeds": 2, "disturb": True, "steps": 60}
+    found = [
+        compare(short(tmp_path, controllers=f"{tmp_path}/law.py:{name}", **options))["drives"]
+        for name in ("Single", "Batch")
+    ]
+    assert len(found[0]) == 2 * 2 * 7
+    for one, many in zip(*found, strict=True):
+        assert one.pop("controller") != many.pop("controller")
+        assert one == many
+
+
+def test_a_drive_whose_steering_is_no_number_is_named_and_the_others_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: {0})  # one batch
+    (tmp_path / "law.py").write_text(BATCH_LAW)
+    config = short(tmp_path, tracks="oval", controllers=f"{tmp_path}/law.py:Broken", seeds=3)
+    with pytest.raises(UserError, match=BROKEN.format(tmp_path)):
+        compare(config)
+    drives = json.loads((config.out / "results.json").read_text())["drives"]
+    whole = compare(replace(config, controllers=f"{tmp_path}/law.py:Batch"))["drives"]
+    assert [drive["seed"] for drive in drives] == [0, 2]
+    assert [drive["result"] for drive in drives] == [whole[k]["result"] for k in (0, 2)]
+
+
 # The search for parameters.
 
 
@@ -296,6 +356,19 @@ def test_the_search_finds_better_parameters_and_is_continued(
         tune(replace(config, seed=1))
 
 
+def test_the_reward_of_a_candidate_is_the_mean_of_single_drives() -> None:
+    config = TuneConfig(tracks="oval,town", steps=60, seed=2, disturbance="noise")
+    alone = [
+        drive(
+            DriveConfig("lqr", name, steps=60, seed=2, start_d=-find_track(name).width / 6),
+            disturbance=DISTURBANCES["noise"],
+            parameters={"rho": 0.1},
+        ).score_per_step
+        for name in ("oval", "town")
+    ]
+    assert evaluate(config, "lqr", {"rho": 0.1}) == np.mean(alone)
+
+
 def test_candidates_stay_within_their_ranges() -> None:
     ranges = {"a": (0.1, 10.0)}
     rng = np.random.default_rng(0)
@@ -321,18 +394,18 @@ def test_candidates_stay_within_their_ranges() -> None:
 def test_a_wrong_search_is_refused_before_its_first_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
 ) -> None:
-    monkeypatch.setattr("controllers.compare.tune.drive", lambda *_, **__: pytest.fail("driven"))
+    monkeypatch.setattr("controllers.compare.tune.drive_many", lambda *_: pytest.fail("driven"))
     with pytest.raises(UserError, match=message):
         tune(TuneConfig(out=tmp_path / "tuned.json", **changes))
     assert not (tmp_path / "tuned.json").exists()
 
 
+@pytest.mark.parametrize("batch", ["", "    def update_batch(self, seen):\n        return {}\n"])
 def test_a_contact_without_pybullet_loses_only_its_own_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: str
 ) -> None:
-    (tmp_path / "left.py").write_text(
-        "class Left:\n    def update(self, observation):\n        return 0.3\n"
-    )
+    law = "class Left:\n    def update(self, observation):\n        return 0.3\n"
+    (tmp_path / "left.py").write_text(law + batch.format("0.3 + 0.0 * seen.angle"))
     crash = f"{tmp_path / 'left.py'}:Left"
     config = short(tmp_path, tracks="oval", controllers=f"{crash},torcs", steps=300)
     with monkeypatch.context() as patch:

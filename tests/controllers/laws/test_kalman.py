@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from controllers.interface import Observation
-from controllers.laws.delay import MAX_DELAY, DelayEstimate
+from controllers.interface import Observation, Observations
+from controllers.laws.delay import MAX_DELAY, first_delays, update_delay
 from controllers.laws.kalman import CAR, KAPPA, StateEstimate, transitions
 from controllers.laws.lqr_gains import GRID_M_S, SLOWEST_M_S
 from trackfeatures import RoadClass
@@ -30,33 +30,34 @@ def motion(steps: int, hz: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np
 def test_the_delay_of_the_heading_is_found(delay: int, noise: float) -> None:
     rng = np.random.default_rng(delay)
     theta, rate = motion(400)
-    found = DelayEstimate(DT)
+    found = first_delays(1, DT)[0]
     for now in range(delay, 400):
         seen = theta[now - delay] + 0.005 * noise * rng.normal()
-        found.update(seen, rate[now] + 0.01 * noise * rng.normal())
-    assert found.is_known
-    assert found.steps == delay
+        update_delay(found, seen, rate[now] + 0.01 * noise * rng.normal(), DT)
+    assert found["is_known"]
+    assert found["steps"] == delay
 
 
 def test_a_given_delay_is_kept() -> None:
     theta, rate = motion(400)
-    found = DelayEstimate(DT, 0.1)
-    assert found.is_known
-    assert not any(found.update(theta[now], rate[now]) for now in range(400))
-    assert found.steps == 2
+    found = first_delays(1, DT, 0.1)[0]
+    assert found["is_known"]
+    assert not any(update_delay(found, theta[now], rate[now], DT) for now in range(400))
+    assert found["steps"] == 2
 
 
 def test_a_given_delay_that_is_too_long_is_refused() -> None:
     with pytest.raises(UserError, match=r"delay is 0\.25 s; .* take 0 to 0\.2 s"):
-        DelayEstimate(DT, 0.25)
+        StateEstimate(DT, 0.25)
 
 
 def test_without_motion_the_delay_stays_unknown() -> None:
     rng = np.random.default_rng(1)
-    found = DelayEstimate(DT)
-    assert not any(found.update(0.005 * rng.normal(), 0.01 * rng.normal()) for _ in range(400))
-    assert found.steps == 0
-    assert not found.is_known
+    found = first_delays(1, DT)[0]
+    for _ in range(400):
+        assert not update_delay(found, 0.005 * rng.normal(), 0.01 * rng.normal(), DT)
+    assert found["steps"] == 0
+    assert not found["is_known"]
 
 
 def test_transitions_are_those_of_the_lateral_model() -> None:
@@ -92,19 +93,17 @@ def drive(
             truth[now] = step[:, :5] @ truth[now - 1] + step[:, 5] * wheel
         seen = truth[max(now - delay, 0)]
         error = noise * rng.normal(size=4) * (0.05, 0.005, 0.1, 0.01)
-        found[now] = estimate.update(
-            Observation(
-                to_lane_centre=seen[0] + error[0],
-                angle=-(seen[1] + error[1]),
-                heading=RoadClass.LEFT,
-                vx=SPEED,
-                vy=truth[now, 2] + error[2],
-                yaw_rate=truth[now, 3] + error[3],
-            ),
-            wheel,
+        observation = Observation(
+            to_lane_centre=seen[0] + error[0],
+            angle=-(seen[1] + error[1]),
+            heading=RoadClass.LEFT,
+            vx=SPEED,
+            vy=truth[now, 2] + error[2],
+            yaw_rate=truth[now, 3] + error[3],
         )
+        found[now] = estimate.update(Observations.of(observation), np.array([wheel]))[0]
         wheel = 0.013 + sway * math.sin(6.0 * DT * now) - 0.02 * truth[now, 0] - 0.3 * truth[now, 1]
-    assert estimate.delay.steps == delay
+    assert estimate.delays["steps"][0] == delay
     return truth, found
 
 

@@ -11,7 +11,7 @@ from controllers.drive.closed_loop import DriveResult
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.run import drive
-from controllers.interface import LoopConfig, Observation
+from controllers.interface import LoopConfig, Observation, Observations
 from controllers.laws.kalman import CAR, StateEstimate, Vector
 from controllers.laws.kalman_control import smooth_gain
 from controllers.laws.lqr_gains import LqrWeights, discrete_gain
@@ -71,9 +71,10 @@ def test_a_drive_on_images_knows_that_its_answers_are_predicted_to_the_present(
     known: list[bool] = []
     real = StateEstimate.update
 
-    def update(self: StateEstimate, seen: Observation, wheel_angle: float) -> Vector:
-        known.append(self.delay.is_known)
-        return real(self, seen, wheel_angle)
+    def update(self: StateEstimate, seen: Observations, wheel_angles: Vector) -> Vector:
+        states = real(self, seen, wheel_angles)
+        known.append(bool(self.delays["is_known"][0]))
+        return states
 
     monkeypatch.setattr(StateEstimate, "update", update)
     config = DriveConfig(controller=controller, perception="model", track="oval", steps=2)

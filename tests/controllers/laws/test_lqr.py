@@ -12,6 +12,7 @@ from controllers.drive.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
 from controllers.laws.lateral_model import LateralModel, Matrix
 from controllers.laws.lqr import (
+    RATE,
     WEIGHTS_BRIEFLY_TRAINED,
     WEIGHTS_EXACT,
     WEIGHTS_PAPER,
@@ -19,7 +20,8 @@ from controllers.laws.lqr import (
     Lqr,
     LqrPaper,
     LqrPreview,
-    RateEstimate,
+    blend_for,
+    next_rate,
 )
 from controllers.laws.lqr_gains import FASTEST_M_S, SLOWEST_M_S, LqrWeights, clqr, dlqr
 from controllers.laws.steering import STEERING_LOCK
@@ -245,10 +247,12 @@ def test_the_released_codes_form_divides_the_regulators_rad_by_21() -> None:
 
 
 def test_rates_are_differences_and_can_be_filtered() -> None:
-    rate = RateEstimate(0.05)
-    assert [rate(x) for x in (1.0, 1.1, 1.1)] == pytest.approx([0.0, 2.0, 0.0])
-    smooth = RateEstimate(0.05, 0.05)
-    assert [smooth(x) for x in (1.0, 1.1, 1.2)] == pytest.approx([0.0, 1.0, 1.5])
+    def rates(values: tuple[float, ...], filter_s: float) -> list[float]:
+        memory = np.zeros(RATE)
+        return [next_rate(memory, value, 0.05, blend_for(0.05, filter_s)) for value in values]
+
+    assert rates((1.0, 1.1, 1.1), 0.0) == pytest.approx([0.0, 2.0, 0.0])
+    assert rates((1.0, 1.1, 1.2), 0.05) == pytest.approx([0.0, 1.0, 1.5])
 
 
 @pytest.mark.parametrize("name", ["lqr", "lqr-preview", "mpc", "mpc-preview", "rl", "rl-residual"])

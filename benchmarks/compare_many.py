@@ -1,0 +1,92 @@
+"""Processor time of the public benchmark of controllers: 23 TORCS tracks, no and six disturbances,
+five seeds: 805 drives a controller.
+
+Run: `python benchmarks/compare_many.py [--controllers lqr,mpc] [--share 1] [--json FILE]`, some
+minutes a controller on two cores. It needs TORCS's tracks (`TORCS_TRACKS`). Each controller drives
+all tracks at once as `controllers compare --disturb --seeds 5` does, over `--share` of the steps of
+each drive; the times are extrapolated to all steps. Beside it one drive of the same steps is timed
+alone, and its numbers are compared. Claim: a controller takes at most 3 minutes of two cores, six
+minutes of processor time.
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.claims.outcome import conclude, not_measured, run_command
+from controllers.compare.run import GRID_SHARE
+from controllers.drive.closed_loop import DriveResult
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import DISTURBANCES
+from controllers.drive.many import Task, drive_many
+from controllers.drive.run import drive, steps_for
+from simulator.track.catalogue import list_tracks
+from trackfeatures.errors import UserError
+
+SEEDS = 5
+LIMIT_S = 360.0
+
+
+def tasks_of(controller: str, share: float) -> tuple[list[Task], int]:
+    """The drives of the benchmark over a `share` of their steps, and the sum of all steps."""
+    tasks, whole = [], 0
+    for track in (one for one in list_tracks(None) if one.source == "torcs"):
+        steps = steps_for(None, track.name, track.length_m)
+        for disturbance in DISTURBANCES.values():
+            for seed in range(SEEDS):
+                config = DriveConfig(
+                    controller=controller,
+                    track=track.name,
+                    steps=max(round(share * steps), 1),
+                    start_d=-GRID_SHARE * track.width,
+                    seed=seed,
+                )
+                tasks.append((config, disturbance))
+                whole += steps
+    return tasks, whole
+
+
+def measure(controller: str, share: float) -> dict[str, float | bool]:
+    """The processor time of the whole benchmark, and that of a step alone and at once."""
+    tasks, whole = tasks_of(controller, share)
+    for _ in drive_many(tasks[:1]):  # compiles
+        pass
+    found: dict[int, DriveResult | UserError] = {}
+    started = time.process_time()
+    for outcomes in drive_many(tasks):
+        found |= {one.number: one.result for one in outcomes}
+    spent = time.process_time() - started
+    steps = sum(config.steps or 0 for config, _ in tasks)
+    started = time.process_time()
+    alone = drive(tasks[0][0], disturbance=tasks[0][1])
+    single = time.process_time() - started
+    return {
+        "drives": len(tasks),
+        "steps_driven": steps,
+        "steps_of_the_benchmark": whole,
+        "processor_s": round(spent, 1),
+        "processor_s_extrapolated": round(spent / steps * whole, 1),
+        "us_a_step": round(1e6 * spent / steps, 1),
+        "us_a_step_alone": round(1e6 * single / alone.steps, 1),
+        "equal": found[0] == alone,
+    }
+
+
+def main(
+    controllers: str = "lqr,mpc,lqr-kalman,rl", share: float = 1.0, json: Path | None = None
+) -> None:
+    if not any(track.source == "torcs" for track in list_tracks(None)):
+        not_measured("TORCS's tracks are missing; set TORCS_TRACKS")
+    figures = {name: measure(name, share) for name in controllers.split(",")}
+    reached = all(
+        one["equal"] and one["processor_s_extrapolated"] <= LIMIT_S for one in figures.values()
+    )
+    conclude({"limit_s": LIMIT_S, **figures}, json, reached)
+
+
+if __name__ == "__main__":
+    run_command(main)
