@@ -206,8 +206,8 @@ def advance(
     """One control step of the filter; returns the present state (5,).
 
     `x` (5,) and `covariance` (5, 5) are the state at the moment of the image, `delay` steps ago;
-    both are replaced. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. `seen`: e
-    and theta of the image, first. `variance` (4,): of the measurements. `process` (5,): variance of the
+    both are replaced. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. `seen`: e and
+    theta of the image, first. `variance` (4,): of the measurements. `process` (5,): variance of the
     model's error.
     """
     predict(x, covariance, table, own[delay + 1, 0], own[delay + 1, 3], process)
