@@ -35,7 +35,7 @@ class Dividing(Held):
 
 
 def task(controller: str, disturbance: Disturbance = ALL, **options: Any) -> Task:
-    values = {"track": "oval", "steps": 80, "start_d": -1.0} | options
+    values: dict[str, Any] = {"track": "oval", "steps": 80, "start_d": -1.0} | options
     return DriveConfig(controller=controller, **values), disturbance
 
 
