@@ -18,12 +18,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.claims.outcome import conclude, not_measured, run_command
-from controllers.compare.run import GRID_SHARE
 from controllers.drive.closed_loop import DriveResult
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.many import Task, drive_many
-from controllers.drive.run import drive, steps_for
+from controllers.drive.run import GRID_SHARE, drive, steps_for
 from simulator.track.catalogue import list_tracks
 from trackfeatures.errors import UserError
 

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from controllers.compare.config import TuneConfig
-from controllers.compare.run import GRID_SHARE, names
+from controllers.compare.run import names
 from controllers.drive.closed_loop import check_reward
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import find_disturbance
 from controllers.drive.many import drive_many
+from controllers.drive.run import GRID_SHARE
 from controllers.registry import CONTROLLERS
 from runtime.files import check_folder, write_json
 from simulator.track.catalogue import find_track
