@@ -5,7 +5,7 @@ layout. The variants run in turns, so that other load on the machine affects all
 graph is calibrated on noise: its outputs are useless, its time is that of any int8 graph.
 
 All compute the network's nine outputs. For a model with an uncertainty head
-(`mtlnet.inference.uncertainty`) the passes `with uncertainty` compute all that `serve` answers.
+(`mtlnet.model.uncertainty_head`) the passes `with uncertainty` compute all that `serve` answers.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
     claims: bf16 at most 0.40 of torch's time, int8 at most 0.20; with uncertainty 0.40 and 0.25
@@ -34,7 +34,7 @@ from mtlnet.export.int8 import quantise
 from mtlnet.inference.engine import best_precision, openvino_core, read_graph
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.model.network import load_network
-from mtlnet.openvino_graph import build_graph
+from mtlnet.model.openvino_graph import build_graph
 
 CLAIMS = {
     "bf16": 0.40,

@@ -104,7 +104,7 @@ def ship_command(
     picture: options.ShippedPicture = None,
     as_json: command.AsJson = False,
 ) -> None:
-    """Write only the weights of a model, in float16: small enough for a repository.
+    """Write a model in half the bytes: weights in float16, and the graph that `serve` loads.
 
     With --evaluation: write README.md, with the figures of evaluations, for the model in --out.
     """

@@ -17,8 +17,7 @@ from mtlnet.data.model_labels import round_rectification
 from mtlnet.evaluation.metrics import GROUPS, signed_errors
 from mtlnet.evaluation.tables import error_cells, mean_error_cells
 from mtlnet.inference.overlay import draw_overlay
-from mtlnet.inference.prediction import Prediction, decode_outputs, split_outputs
-from mtlnet.inference.uncertainty import FEATURES
+from mtlnet.inference.prediction import FEATURES, Prediction, decode_outputs, split_outputs
 from runtime.files import atomic_write
 from runtime.html import embed_jpeg, format_percent, render
 from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_diagram

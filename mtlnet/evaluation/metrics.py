@@ -1,6 +1,6 @@
 """Metrics of a model's outputs on labelled frames: errors in m and rad, by feature.
 
-A feature is one of `mtlnet.inference.uncertainty.FEATURES`: the five markings, `to_lane_centre` and
+A feature is one of `mtlnet.inference.prediction.FEATURES`: the five markings, `to_lane_centre` and
 `angle`. Errors are predicted minus true; they are NaN, and not counted, where the label is inactive
 or unknown. The baseline is a constant prediction, the mean of the training labels.
 """
@@ -16,8 +16,7 @@ import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.data.description import nan_where_unknown
 from mtlnet.data.loader import LabelArrays
-from mtlnet.inference.prediction import OUTPUTS, split_outputs
-from mtlnet.inference.uncertainty import FEATURES
+from mtlnet.inference.prediction import FEATURES, OUTPUTS, split_outputs
 from trackfeatures.definitions import UNKNOWN_HEADING
 
 PERCENTILES = {"median": 50, "p95": 95, "p99": 99}

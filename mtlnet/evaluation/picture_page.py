@@ -22,8 +22,8 @@ from mtlnet.inference.overlay import (
     draw_road_line,
     marking_line,
 )
+from mtlnet.inference.prediction import FEATURES as ANSWERS
 from mtlnet.inference.prediction import split_outputs
-from mtlnet.inference.uncertainty import FEATURES as ANSWERS
 from runtime.files import atomic_write, name_as_text
 from runtime.html import embed_jpeg, format_number, format_percent, render
 from trackfeatures.camera import CameraParameters

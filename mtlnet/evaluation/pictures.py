@@ -65,7 +65,7 @@ class Answers:
     @property
     def label_std(self) -> NDArray[np.float64]:
         """Standard deviations of the labels (N, 7), in the order of
-        `mtlnet.inference.uncertainty.FEATURES`."""
+        `mtlnet.inference.prediction.FEATURES`."""
         stds = [[p.std_m] * 6 + [p.std_rad] for p in self.images.pictures]
         return np.array(stds, np.float64)
 

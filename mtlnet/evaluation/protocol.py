@@ -20,8 +20,7 @@ from mtlnet.data.rounds import require_decodable
 from mtlnet.evaluation.evaluate import about, predict_frames, require_fit
 from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.prediction import OUTPUTS
-from mtlnet.inference.uncertainty import FEATURES
+from mtlnet.inference.prediction import FEATURES, OUTPUTS
 from trackfeatures.definitions import UNKNOWN_HEADING
 from trackfeatures.errors import UserError
 

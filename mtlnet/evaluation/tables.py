@@ -7,7 +7,7 @@ from rich.table import Table
 
 import trackfeatures as tf
 from mtlnet.evaluation.metrics import GROUPS, feature_mean
-from mtlnet.inference.uncertainty import FEATURES
+from mtlnet.inference.prediction import FEATURES
 from runtime.cli import printable
 from runtime.html import format_number, format_percent
 

@@ -30,29 +30,30 @@ from mtlnet.export.int8 import (
     judge,
     quantise,
 )
-from mtlnet.inference.engine import EXPORT_FILE, best_precision, read_graph
+from mtlnet.inference.engine import EXPORT_FILE, best_precision, run_graph
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
-    MODEL_FILES,
-    WEIGHTS,
     ModelCard,
     ModelError,
-    check_files,
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.torch_engine import load_served
 from mtlnet.inference.trained_rounds import names_entry
-from mtlnet.inference.uncertainty import read_uncertainty_head
-from mtlnet.model.network import Network, load_network, predict_images
-from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph
+from mtlnet.model.network import Network, predict_images
+from mtlnet.model.openvino_graph import (
+    MIN_NARROW_VALUES,
+    TOLERANCE,
+    build_graph,
+    narrow_constants,
+)
 from runtime.files import atomic_move, file_hash, replaced_files, utf8_path, write_json
 from trackfeatures.errors import UserError
 
 FORMATS, PRECISIONS = ("onnx", "openvino"), ("f32", "bf16", "int8")
 ONNX_FILE = "model.onnx"
 OPSET = 18
-MIN_BF16_VALUES = 256  # smaller constants stay in float32
 CHECK_BATCH = 3  # images at once
 MAX_CHECK_FRAMES = 10_000
 """Maximum number of frames, whose images are held in memory (1.8 GB)."""
@@ -73,7 +74,6 @@ def export_model(
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
-    check_files(run, card, tuple(name for name in MODEL_FILES if name in card.files))
     source = data or Path(card.data.get("path", "datasets/default"))
     if has_labels_file(source):
         raise UserError(
@@ -85,7 +85,8 @@ def export_model(
     require_fit(card, shown, "all")
     chosen = np.linspace(0, len(shown) - 1, min(frames, len(shown))).astype(np.int64)
     folder = out or run / "export" / f"{kind}-{precision}"
-    network = load_network(run / WEIGHTS, card.network)
+    served = load_served(run, card)
+    network = served.network
     images = shown.read_batch(chosen)
     about: dict[str, Any] = {"format": kind, "precision": precision}
     with replaced_files(folder, last=EXPORT_FILE) as staged:
@@ -93,12 +94,10 @@ def export_model(
             if kind == "onnx":
                 names = write_onnx(network, staged, bf16=precision == "bf16")
             else:
-                if precision == "int8":
-                    graph = read_graph(run, card)
+                int8 = precision == "int8"
+                graph = build_graph(network, served.head, batch=1 if int8 else -1)
+                if int8:
                     graph, about["float_activations"] = _quantised(graph, card, dataset)
-                else:
-                    head = None if card.uncertainty is None else read_uncertainty_head(run)
-                    graph = build_graph(network, head, batch=-1)
                 names = write_openvino(graph, staged, precision)
         except RuntimeError as error:  # OpenVINO's error for a failed write
             reason = str(error).strip().splitlines()[-1]
@@ -219,7 +218,7 @@ def store_onnx_bf16(model: Any) -> None:
 
     casts = []
     for tensor in model.graph.initializer:
-        if tensor.data_type != onnx.TensorProto.FLOAT or np.prod(tensor.dims) < MIN_BF16_VALUES:
+        if tensor.data_type != onnx.TensorProto.FLOAT or np.prod(tensor.dims) < MIN_NARROW_VALUES:
             continue
         rounded = numpy_helper.to_array(tensor).astype(ml_dtypes.bfloat16)
         name = tensor.name
@@ -235,32 +234,11 @@ def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
     import openvino
 
     model.inputs[0].get_node().set_layout(openvino.Layout("[batch,height,width,colour]"))
-    model.inputs[0].get_tensor().set_names({"images"})
-    model.outputs[0].get_tensor().set_names({"outputs"})
     if precision == "bf16":
-        store_openvino_bf16(model)
+        narrow_constants(model, "bf16")
     with utf8_path(folder / GRAPH) as plain:
         openvino.save_model(model, str(plain), compress_to_fp16=False)
     return (GRAPH, GRAPH_WEIGHTS)
-
-
-def store_openvino_bf16(model: Any) -> None:
-    """Store large float32 weights of an OpenVINO model in bf16, with conversions to float32 (in
-    place)."""
-    import openvino
-    from openvino import opset13 as ops
-
-    for node in model.get_ordered_ops():
-        if node.get_type_name() != "Constant" or node.get_element_type() != openvino.Type.f32:
-            continue
-        if int(np.prod(node.get_output_shape(0))) < MIN_BF16_VALUES:
-            continue
-        readers = node.output(0).get_target_inputs()
-        rounded = ops.constant(node.get_data(), dtype=openvino.Type.bf16)
-        widened = ops.convert(rounded, "f32")
-        widened.get_rt_info()["decompression_0"] = ""
-        for reader in readers:
-            reader.replace_source_output(widened.output(0))
 
 
 def check_export(

@@ -24,8 +24,7 @@ from datagen.recording import Frames
 from mtlnet.data.model_labels import model_labels
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.evaluation.metrics import evaluate_outputs
-from mtlnet.inference.engine import load_engine
-from mtlnet.openvino_graph import run_graph
+from mtlnet.inference.engine import load_engine, run_graph
 from runtime.processor import has_int8
 
 CALIBRATION_FRAMES = 300
@@ -129,17 +128,10 @@ def operation_names(model: Any, kind: str) -> list[str]:
 
 
 def float_weights(model: Any) -> list[str]:
-    """Names of the MatMuls whose weights are not quantised.
-
-    These are the last shared layer and the texture's MatMuls, which depend on no convolution.
-    """
-    after: set[str] = set()
-    for op in model.get_ordered_ops():
-        inputs = (value.get_node().get_friendly_name() for value in op.input_values())
-        if op.get_type_name() == "Convolution" or not after.isdisjoint(inputs):
-            after.add(op.get_friendly_name())
+    """Names of the MatMuls whose weights are not quantised: all but the shared layers, and the
+    last of these."""
     products = operation_names(model, "MatMul")
-    shared = [name for name in products if name in after]
+    shared = [name for name in products if ".shared." in name]
     return [name for name in products if name not in shared[:-1]]
 
 

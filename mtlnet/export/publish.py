@@ -2,7 +2,7 @@
 
 All files are moved into place together, after the graph has been compared with torch on real
 frames, and the card last: a run without a card has no finished model. Without OpenVINO no graph is
-written; an engine then builds it from the weights.
+written; an engine then converts the weights when it loads them, which needs torch.
 """
 
 import platform
@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors.torch import save
 
 import trackfeatures as tf
 from mtlnet.architecture import HEIGHT, WIDTH
-from mtlnet.inference.engine import best_precision, has_openvino
+from mtlnet.inference.engine import best_precision, has_openvino, run_graph
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
@@ -30,15 +31,11 @@ from mtlnet.inference.model_card import (
     ModelCard,
     ModelError,
 )
-from mtlnet.inference.prediction import OUTPUTS
-from mtlnet.inference.uncertainty import (
-    FittedUncertainty,
-    UncertaintyHead,
-    texture_features,
-    write_uncertainty_head,
-)
-from mtlnet.model.network import Network, fold, predict_images, run_network
-from mtlnet.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, run_graph, write_graph
+from mtlnet.inference.prediction import COLUMNS, OUTPUTS
+from mtlnet.model.network import Network, fold, predict_images
+from mtlnet.model.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, write_graph
+from mtlnet.model.served import ServedNetwork
+from mtlnet.model.uncertainty_head import FittedUncertainty, UncertaintyHead
 from runtime.files import atomic_write, file_hash, replaced_files
 from trackfeatures.camera import CameraParameters
 from trackfeatures.names import to_name
@@ -74,7 +71,7 @@ def publish(
     `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
     `uncertainty` the model predicts no standard deviations. Without OpenVINO the run gets no graph,
     and nothing is compared. Raises ModelError when the graph differs by more than the tolerances of
-    `mtlnet.openvino_graph`. After an error the run has the model that it had before.
+    `mtlnet.model.openvino_graph`. After an error the run has the model that it had before.
     """
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
@@ -87,7 +84,7 @@ def publish(
     with replaced_files(run, last=CARD) as staged:
         atomic_write(staged / WEIGHTS, save(weights), fsync=True)
         if head is not None:
-            write_uncertainty_head(staged, head)
+            atomic_write(staged / UNCERTAINTY_WEIGHTS, head.to_bytes(), fsync=True)
         check = {"frames": 0.0}
         if GRAPH in names:
             write_graph(folded, staged / GRAPH, staged / GRAPH_WEIGHTS, head)
@@ -141,9 +138,12 @@ def compare_graph(
     `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs. The difference of
     an out-of-distribution score is relative to at least `LEAST_OOD_SCORE`.
     """
-    answers = run_network(network, images)
-    textures = np.stack([texture_features(image) for image in images])
-    uncertainty = None if head is None else head.predict(answers.uncertainty_inputs, textures)
+    with torch.inference_mode():
+        expected = ServedNetwork(network, head)(torch.from_numpy(images)).numpy()
+    uncertain = np.zeros(expected.shape[1], bool)
+    uncertain[OUTPUTS : OUTPUTS + (COLUMNS if head is not None else 0)] = True
+    reference = expected[:, uncertain].copy()
+    reference[:, -1:] = np.maximum(reference[:, -1:], LEAST_OOD_SCORE)
     differences = {"frames": float(len(images))}
     for precision in dict.fromkeys(("f32", best_precision())):
         try:
@@ -154,15 +154,10 @@ def compare_graph(
                 f"OpenVINO cannot load {run / GRAPH}, just written ({reason}): the model is not "
                 "published; is the disk full?"
             ) from error
-        expected = np.concatenate([answers.outputs, answers.absent], 1)
-        absent = outputs[:, outputs.shape[1] - answers.absent.shape[1] :]
-        found = np.concatenate([outputs[:, :OUTPUTS], absent], 1)
-        differences[f"openvino_{precision}_max"] = float(np.abs(found - expected).max())
-        if uncertainty is not None:
-            columns = slice(OUTPUTS, OUTPUTS + uncertainty.shape[1])
-            reference = uncertainty.copy()
-            reference[:, -1] = np.maximum(reference[:, -1], LEAST_OOD_SCORE)
-            relative = np.abs(outputs[:, columns] - uncertainty) / reference
+        apart = np.abs(outputs - expected)
+        differences[f"openvino_{precision}_max"] = float(apart[:, ~uncertain].max())
+        if head is not None:
+            relative = apart[:, uncertain] / reference
             differences[f"openvino_{precision}_uncertainty"] = float(relative.max())
     return differences
 

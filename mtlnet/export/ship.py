@@ -1,9 +1,9 @@
-"""`mtlnet ship --model RUN --out DIR`: a model as weights alone, in half the bytes.
+"""`mtlnet ship --model RUN --out DIR`: a model in half the bytes.
 
-The folder has `model.safetensors` in float16, the uncertainty head in float32 and the card: all
-that an engine needs (`mtlnet.inference.engine.read_graph`). The answers of the shipped model, and
-the answers in its card, are computed from the rounded weights. `write_page` adds a README.md with
-the figures of evaluations.
+The folder has `model.safetensors` in float16, the uncertainty head in float32, the served graph of
+the same numbers and the card. Without OpenVINO no graph is written. Answers, and those in the card,
+are computed from the rounded weights. `write_page` adds a README.md with the figures of
+evaluations.
 """
 
 import json
@@ -17,25 +17,26 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from mtlnet.architecture import HEIGHT, WIDTH, find_architecture
+from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.evaluation.metrics import GROUPS
 from mtlnet.inference.engine import INT8, Engine, has_openvino, load_engine, read_export
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
+    GRAPH,
+    GRAPH_WEIGHTS,
+    MODEL_FILES,
     UNCERTAINTY_WEIGHTS,
     WEIGHTS,
     ModelCard,
     ModelError,
-    check_files,
     read_card,
 )
 from mtlnet.inference.prediction import OUTPUTS
+from mtlnet.inference.torch_engine import load_served
 from mtlnet.inference.trained_rounds import Seeds
-from mtlnet.inference.uncertainty import write_uncertainty_head
-from mtlnet.inference.weights_file import read_weights
 from mtlnet.model.network import load_network, predict_images
-from mtlnet.openvino_graph import TOLERANCE
+from mtlnet.model.openvino_graph import TOLERANCE, write_graph
 from mtlnet.uncertainty_fit.head import refit_uncertainty_head
 from runtime.files import atomic_write, file_hash
 from runtime.html import format_number, format_percent
@@ -49,16 +50,10 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
     """Write the model of `run` to the new folder `out`; returns the result of `--json`.
 
     `data`: a dataset on which the uncertainty head is fitted again (`refit_uncertainty_head`).
-    Raises UserError when the network cannot be rebuilt from weights alone or `out` has a model
-    already, ModelError when the answers differ from the run's by more than the rounding of the
-    weights.
+    Raises UserError when `out` has a model already, ModelError when the answers differ from the
+    run's by more than the rounding of the weights.
     """
     card = read_card(run)
-    if find_architecture(card.network).backbone:
-        raise UserError(
-            f"network {card.network} is torchvision's: its graph cannot be made of weights alone; "
-            f"serve the run itself with `serve --model {run}`"
-        )
     if (out / CARD).exists():
         raise UserError(f"{out} already holds a model; give another --out or delete it")
     refitted = None if data is None else refit_uncertainty_head(run, data)
@@ -66,17 +61,19 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
         seeds = Seeds.read(card.data["seeds"]) | Seeds.read(refitted.about["seeds"])
         seen = {**card.data, "seeds": seeds.entry()}
         card = replace(card, uncertainty=refitted.about, data=seen)
-    names = (WEIGHTS,) if card.uncertainty is None else (WEIGHTS, UNCERTAINTY_WEIGHTS)
-    check_files(run, card, names if refitted is None else (WEIGHTS,))
+    names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
+    if card.uncertainty is not None:
+        names = (*names, UNCERTAINTY_WEIGHTS)
+    served = load_served(run, replace(card, uncertainty=None) if refitted is not None else card)
+    head = served.head if refitted is None else refitted.head
+    halves = {name: half(name, t.numpy()) for name, t in served.network.state_dict().items()}
     out.mkdir(parents=True, exist_ok=True)
-    halves = {name: half(name, values) for name, values in read_weights(run / WEIGHTS).items()}
     atomic_write(out / WEIGHTS, save(halves), fsync=True)
-    if refitted is not None:
-        write_uncertainty_head(out, refitted.head)
-    elif card.uncertainty is not None:
-        atomic_write(
-            out / UNCERTAINTY_WEIGHTS, (run / UNCERTAINTY_WEIGHTS).read_bytes(), fsync=True
-        )
+    if head is not None:
+        atomic_write(out / UNCERTAINTY_WEIGHTS, head.to_bytes(), fsync=True)
+    if GRAPH in names:
+        network = load_network(out / WEIGHTS, card.network)
+        write_graph(network, out / GRAPH, out / GRAPH_WEIGHTS, head, narrow=True)
     shipped = _card_of(out, card, names)
     shipped.write(out)
     try:

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
-    UNCERTAINTY_WEIGHTS,
-    WEIGHTS,
     ModelCard,
     ModelError,
     check_files,
@@ -133,21 +131,38 @@ def _read_model(graph: Path) -> Any:
 
 
 def read_graph(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run: its stored graph, or a graph built from its weights.
+    """The OpenVINO model of a run: its stored graph. A run that was written where OpenVINO was
+    missing has none; its weights are converted, which needs torch.
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
     """
     if GRAPH in card.files:
         check_files(run, card, (GRAPH, GRAPH_WEIGHTS))
         return _read_model(run / GRAPH)
-    from mtlnet.inference.graph import model_from_weights
-    from mtlnet.inference.uncertainty import read_uncertainty_head
-    from mtlnet.inference.weights_file import read_weights
+    if find_spec("torch") is None:
+        raise ModelError(
+            f"{run} has no graph ({GRAPH}), because it was written where OpenVINO is not "
+            f"installed; `mtlnet ship --model {run} --out FOLDER` writes a model with a graph, "
+            "where torch and OpenVINO are installed"
+        )
+    from mtlnet.inference.torch_engine import convert_run
 
-    has_head = card.uncertainty is not None
-    check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
-    head = read_uncertainty_head(run) if has_head else None
-    return model_from_weights(card.network, read_weights(run / WEIGHTS), head)
+    return convert_run(run, card)
+
+
+def run_graph(
+    graph: Any, precision: str, images: NDArray[np.uint8], batch: int = 1
+) -> NDArray[np.float32]:
+    """Outputs (N, 9 to 22) of an OpenVINO model for images (N, 210, 280, 3).
+
+    `graph`: the model or the path of its file; `batch`: images per inference. Raises RuntimeError
+    when OpenVINO cannot load it.
+    """
+    options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
+    source = str(graph) if isinstance(graph, Path) else graph
+    request = openvino_core().compile_model(source, "CPU", options).create_infer_request()
+    parts = (images[first : first + batch] for first in range(0, len(images), batch))
+    return np.concatenate([request.infer([part])[0].copy() for part in parts])
 
 
 # Exports of a run. Each has an `export.json` of `mtlnet export`.

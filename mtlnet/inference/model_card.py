@@ -2,7 +2,7 @@
 
 The folder of a run contains `card.json`, `config.json`, `model.safetensors` (the weights, batch
 normalisation folded), `uncertainty.safetensors` (the uncertainty head), `model.xml` and `model.bin`
-(the OpenVINO graph), `curves.csv`, `checkpoints/` and `tensorboard/`.
+(the served graph, for OpenVINO), `curves.csv`, `checkpoints/` and `tensorboard/`.
 """
 
 import json
@@ -25,6 +25,8 @@ CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.x
 UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
 SHIPPED_FILES = {
     WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
+    GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
+    GRAPH_WEIGHTS: "c29fa70baad6ab421c4dcbd9d0dd9a25dfed741cf77b11d526ef2f08fbdd7208",
     UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
 }
 """SHA-256 of the shipped model's files."""

@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.inference.uncertainty import COLUMNS, FEATURES
 
+FEATURES = (*tf.MARKINGS, "to_lane_centre", "angle")
+"""Features that have a standard deviation, in m, and in rad for the angle."""
+COLUMNS = len(FEATURES) + 1
+"""Number of columns of the uncertainty head: the standard deviations and the out-of-distribution
+score."""
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
 MARKINGS = len(tf.MARKINGS)
 ROAD_CLASSES = tuple(heading.name.lower() for heading in tf.RoadClass)
@@ -44,7 +48,7 @@ class OutputParts:
 def split_outputs(outputs: NDArray[np.float32]) -> OutputParts:
     """Split outputs (..., 9 to 22): nine outputs, then uncertainty (8) and absence (5) if present.
 
-    `mtlnet.inference.uncertainty` defines the uncertainty columns. Raises ValueError for another
+    `mtlnet.model.uncertainty_head` defines the uncertainty columns. Raises ValueError for another
     number of columns.
     """
     width = outputs.shape[-1] if outputs.ndim else 0
@@ -79,7 +83,7 @@ class Prediction:
     heading: dict[str, float]
     """Probability of each class of the road, by name."""
     std: dict[str, float | None] | None = None
-    """Standard deviation of the error of each of `mtlnet.inference.uncertainty.FEATURES`, m or rad;
+    """Standard deviation of the error of each of `FEATURES`, m or rad;
     None for an absent feature."""
     out_of_distribution: bool | None = None
     """Whether the image differs from the training images more than these differ from each other."""

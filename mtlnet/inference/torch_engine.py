@@ -1,17 +1,27 @@
-"""The reference engine: the network in torch, float32, with which the exported graph is compared.
+"""The reference engine: the network in torch, float32, from which the served graph is converted.
 
 The only module of `mtlnet.inference` that imports torch.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 
-from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, ModelCard, check_files
-from mtlnet.inference.uncertainty import read_uncertainty_head, texture_features
-from mtlnet.model.network import load_network, run_network
+from mtlnet.inference.model_card import (
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
+    ModelCard,
+    ModelError,
+    check_files,
+)
+from mtlnet.model.network import RUN_BATCH, load_network
+from mtlnet.model.openvino_graph import build_graph
+from mtlnet.model.served import ServedNetwork
+from mtlnet.model.uncertainty_head import UncertaintyHead, load_uncertainty_head
 
 
 class TorchEngine:
@@ -22,16 +32,13 @@ class TorchEngine:
 
     def __init__(self, run: Path, card: ModelCard, threads: int = 1, *, gpu: bool = False) -> None:
         """`gpu`: compute on a GPU if there is one."""
-        has_head = card.uncertainty is not None
-        check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
         torch.set_num_threads(threads)
         self.card = card
         self.on_gpu = gpu and torch.cuda.is_available()
-        self._network = load_network(run / WEIGHTS, card.network)
+        self.served = load_served(run, card)
         if self.on_gpu:
             torch.backends.cudnn.allow_tf32 = False  # TF32, the default, rounds to 10 bits
-            self._network.to("cuda")
-        self._head = read_uncertainty_head(run) if has_head else None
+            self.served.to("cuda")
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.card.check_image(image)
@@ -40,9 +47,33 @@ class TorchEngine:
 
     def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Outputs (B, 9) to (B, 22) for images (B, H, W, 3)."""
-        answers = run_network(self._network, images)
-        parts = [answers.outputs]
-        if self._head is not None:
-            textures = np.stack([texture_features(image) for image in images])
-            parts.append(self._head.predict(answers.uncertainty_inputs, textures))
-        return np.concatenate([*parts, answers.absent], 1)
+        device = "cuda" if self.on_gpu else "cpu"
+        with torch.inference_mode():
+            parts = [
+                self.served(torch.from_numpy(images[first : first + RUN_BATCH]).to(device)).cpu()
+                for first in range(0, max(len(images), 1), RUN_BATCH)
+            ]
+        return torch.cat(parts).numpy()
+
+
+def load_served(run: Path, card: ModelCard) -> ServedNetwork:
+    """The network of a run and its head. Raises ModelError when a file is missing or damaged."""
+    has_head = card.uncertainty is not None
+    check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
+    head = read_uncertainty_head(run) if has_head else None
+    return ServedNetwork(load_network(run / WEIGHTS, card.network), head).eval()
+
+
+def convert_run(run: Path, card: ModelCard) -> Any:
+    """The OpenVINO model of a run that has no graph. Raises ModelError as `load_served`."""
+    served = load_served(run, card)
+    return build_graph(served.network, served.head)
+
+
+def read_uncertainty_head(run: Path) -> UncertaintyHead:
+    """The uncertainty head of the model in `run`. Raises ModelError when it is damaged."""
+    path = run / UNCERTAINTY_WEIGHTS
+    try:
+        return load_uncertainty_head(path)
+    except (SafetensorError, KeyError, RuntimeError, OSError) as error:
+        raise ModelError(f"{path} cannot be read ({error}); train the model again") from error

@@ -1,4 +1,4 @@
-"""Fits the standard deviations of the uncertainty head (`mtlnet.inference.uncertainty`).
+"""Fits the standard deviations of the uncertainty head (`mtlnet.model.uncertainty_head`).
 
 A network's errors are smaller on frames of its training than on new ones. Therefore some train
 rounds are held out of the training (`mtlnet.data.rounds.hold_out_rounds`); they determine the scale
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 import trackfeatures as tf
 from datagen.recording import Frames
@@ -25,16 +25,16 @@ from mtlnet.data.rounds import (
 )
 from mtlnet.evaluation.metrics import coverage
 from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
+from mtlnet.inference.prediction import FEATURES
 from mtlnet.inference.trained_rounds import Seeds, names_entry
-from mtlnet.inference.uncertainty import (
-    CELL_VALUES,
-    FEATURES,
-    HALVES,
+from mtlnet.model.network import Network, load_network
+from mtlnet.model.textures import CELL_VALUES, HALVES
+from mtlnet.model.uncertainty_head import (
     FittedUncertainty,
+    TwoLayers,
     UncertaintyHead,
     standardise,
 )
-from mtlnet.model.network import Network, load_network
 from mtlnet.uncertainty_fit.frame_outputs import FrameOutputs, run_on_frames
 from mtlnet.uncertainty_fit.ood import (
     FitSettings,
@@ -95,10 +95,14 @@ def fit_uncertainty_head(
     centre, scale = standardisation(known.x, count)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the head is small, and more threads are slower
-    known_z = standardise(known.x, centre, scale, count)
-    held_out_z = (
-        None if unseen is None else replace(unseen, x=standardise(unseen.x, centre, scale, count))
-    )
+
+    def standardised(x: NDArray[np.float32]) -> NDArray[np.float32]:
+        tensors = (torch.from_numpy(each) for each in (x, centre, scale))
+        found: NDArray[np.float32] = standardise(*tensors, count=count).numpy()
+        return found
+
+    known_z = standardised(known.x)
+    held_out_z = None if unseen is None else replace(unseen, x=standardised(unseen.x))
     std_layers = fit_std_layers(known_z, known.error, seed, held_out_z)
     textures = limiting = known.texture
     if unseen is not None:
@@ -114,22 +118,18 @@ def fit_uncertainty_head(
     mean, directions = fit_texture_distance(
         textures[:, :CELL_VALUES], limiting[:, :CELL_VALUES], rate
     )
-    head = UncertaintyHead(
-        centre,
-        scale,
-        **std_layers,
-        texture_mean=mean,
-        texture_directions=directions,
-        **pitch_layers,
-    )
+    arrays = {"centre": centre, "scale": scale, **std_layers, **pitch_layers}
+    arrays |= {"texture_mean": mean, "texture_directions": directions}
+    head = UncertaintyHead({name: torch.from_numpy(array) for name, array in arrays.items()})
     judged = unseen or known
     rounds = held_out.rounds if isinstance(held_out, Frames) else []
+    found = head(torch.from_numpy(judged.x[:, :count]), torch.from_numpy(judged.texture)).numpy()
     about = {
         "features": list(FEATURES),
         "held_out": names_entry(info.id for info in rounds),
         "frames": len(judged.x),
         "false_alarm_rate": FALSE_ALARM_RATE,
-        "coverage": coverage(head.predict(judged.x, judged.texture)[:, :-1], judged.error),
+        "coverage": coverage(found[:, :-1], judged.error),
     }
     return FittedUncertainty(head, about)
 
@@ -171,7 +171,7 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
 def standardisation(
     x: NDArray[np.float32], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean (F,) and inverse standard deviation (F,) of inputs (N, F), for `UncertaintyHead`.
+    """Mean (F,) and inverse standard deviation (F,) of inputs (N, F), for `standardise`.
 
     The first `count` inputs are the network's, the others the light. The standard deviation of a
     feature counts as at least `MIN_FEATURE_STD_SHARE` of the mean one: a unit that is silent on
@@ -187,7 +187,7 @@ def standardisation(
 def fit_std_layers(
     z: NDArray[np.float32], error: NDArray[np.float32], seed: int, held_out: FrameOutputs | None
 ) -> dict[str, NDArray[np.float32]]:
-    """Fit the layers that predict standard deviations; returns fields of `UncertaintyHead` by name.
+    """Fit the layers that predict standard deviations; returns a part of `UncertaintyHead`'s state.
 
     `z` (N, F): standardised features, `error` (N, D); `held_out`: frames with standardised `x`. The
     layers are fitted on all frames. Temperature scaling (Guo et al. 2017) brings the shares of
@@ -210,10 +210,10 @@ def fit_std_layers(
     temperature = _temperatures(ratio)
     layers = _train(x, scaled, seed)
     return {
-        "hidden_weight": layers.first.weight.detach().numpy(),
-        "hidden_bias": layers.first.bias.detach().numpy(),
-        "weight": layers.second.weight.detach().numpy(),
-        "bias": (layers.second.bias.detach().numpy() + np.log(rms * temperature)).astype(
+        "std.first.weight": layers.first.weight.detach().numpy(),
+        "std.first.bias": layers.first.bias.detach().numpy(),
+        "std.second.weight": layers.second.weight.detach().numpy(),
+        "std.second.bias": (layers.second.bias.detach().numpy() + np.log(rms * temperature)).astype(
             np.float32
         ),
         "low": np.log(rms * MIN_STD_SHARE).astype(np.float32),
@@ -255,10 +255,10 @@ def _temperature(ratio: NDArray[np.float32]) -> float:
     return float(candidates[misses.argmin()])
 
 
-def _train(z: Tensor, error: Tensor, seed: int) -> "_StdLayers":
+def _train(z: Tensor, error: Tensor, seed: int) -> TwoLayers:
     """Layers z (N, F) -> log scales (N, D) of the most likely t distributions of the errors."""
     generator = torch.Generator().manual_seed(seed)
-    layers = _StdLayers(z.shape[1], generator)
+    layers = _start_layers(z.shape[1], generator)
     present = (~error.isnan()).float()
     squares = error.nan_to_num() ** 2
 
@@ -275,17 +275,11 @@ def _train(z: Tensor, error: Tensor, seed: int) -> "_StdLayers":
     return layers
 
 
-class _StdLayers(nn.Module):
-    """Two layers; the second starts at 0, the logarithm of an error's RMS."""
-
-    def __init__(self, size: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.first, self.second = nn.Linear(size, HIDDEN), nn.Linear(HIDDEN, len(FEATURES))
-        with torch.no_grad():
-            self.first.weight.normal_(0.0, size**-0.5, generator=generator)
-            for parameter in (self.first.bias, self.second.weight, self.second.bias):
-                parameter.zero_()
-
-    def forward(self, z: Tensor) -> Tensor:
-        log_std: Tensor = self.second(self.first(z).relu())
-        return log_std
+def _start_layers(size: int, generator: torch.Generator) -> TwoLayers:
+    """Two layers whose result is 0, the logarithm of an error's RMS."""
+    layers = TwoLayers(size, HIDDEN, len(FEATURES))
+    with torch.no_grad():
+        layers.first.weight.normal_(0.0, size**-0.5, generator=generator)
+        for parameter in (layers.first.bias, layers.second.weight, layers.second.bias):
+            parameter.zero_()
+    return layers

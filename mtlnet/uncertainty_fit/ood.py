@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from mtlnet.data.augment.geometric import rotation_homography
 from mtlnet.data.loader import Images
-from mtlnet.inference.uncertainty import (
+from mtlnet.model.textures import (
     BANDS,
     CELL_COLUMNS,
     CELL_ROWS,
@@ -30,6 +30,7 @@ from mtlnet.inference.uncertainty import (
     CENTRE_COLUMNS,
     texture_features,
 )
+from mtlnet.model.uncertainty_head import TwoLayers
 from trackfeatures.camera import CameraParameters
 
 MIN_SPREAD = 0.05
@@ -136,7 +137,8 @@ def pitched_views(
             view = cv2.warpPerspective(
                 image[0], homography, size, borderMode=cv2.BORDER_REFLECT_101
             )
-            centres.append(texture_features(view.astype(np.uint8, copy=False))[CELL_VALUES:])
+            textures = texture_features(torch.from_numpy(view.astype(np.uint8, copy=False)[None]))
+            centres.append(textures[0, CELL_VALUES:].numpy())
             pitches.append(pitch)
     return np.array(centres), np.array(pitches, np.float32)
 
@@ -148,7 +150,8 @@ def fit_pitch_offset(
     false_alarm_rate: float,
     seed: int,
 ) -> dict[str, NDArray[np.float32]]:
-    """Fit the pitch regressor; returns the `pitch_*` fields of `UncertaintyHead`.
+    """Fit the pitch regressor; returns the `pitch*` part of the state of
+    `UncertaintyHead`.
 
     `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: those
     of `pitched_views`, and their pitches. Scaled so that a share `false_alarm_rate` of the held-out
@@ -170,10 +173,10 @@ def fit_pitch_offset(
     return {
         "pitch_centre": centre.astype(np.float32),
         "pitch_scale": scale.astype(np.float32),
-        "pitch_hidden_weight": hidden_weight,
-        "pitch_hidden_bias": hidden_bias,
-        "pitch_weight": (weight / limit).astype(np.float32),
-        "pitch_bias": ((bias - zero) / limit).astype(np.float32),
+        "pitch.first.weight": hidden_weight,
+        "pitch.first.bias": hidden_bias,
+        "pitch.second.weight": (weight / limit).astype(np.float32),
+        "pitch.second.bias": ((bias - zero) / limit).astype(np.float32),
     }
 
 
@@ -181,17 +184,16 @@ def _train(z: Tensor, target: Tensor, seed: int) -> list[NDArray[np.float32]]:
     """Weight, bias, weight and bias of two layers z (N, M) -> target (N, 1), fitted by smooth L1
     loss."""
     generator = torch.Generator().manual_seed(seed)
-    layers = nn.Linear(z.shape[1], HIDDEN), nn.Linear(HIDDEN, 1)
+    layers = TwoLayers(z.shape[1], HIDDEN, 1)
     with torch.no_grad():
-        for layer in layers:
+        for layer in (layers.first, layers.second):
             layer.weight.normal_(0.0, layer.in_features**-0.5, generator=generator)
             layer.bias.zero_()
 
     def loss(rows: Tensor) -> Tensor:
-        predicted = layers[1](layers[0](z[rows]).relu())
-        return nn.functional.smooth_l1_loss(predicted, target[rows], beta=0.1)
+        return nn.functional.smooth_l1_loss(layers(z[rows]), target[rows], beta=0.1)
 
-    parameters = [p for layer in layers for p in layer.parameters()]
+    parameters = list(layers.parameters())
     minimise(loss, parameters, len(z), FIT, generator)
     return [parameter.detach().numpy() for parameter in parameters]
 

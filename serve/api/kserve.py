@@ -2,7 +2,7 @@
 
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
 width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN if absent;
-`std` in the order of `mtlnet.inference.uncertainty`; `out_of_distribution` 0 or 1; `absent` in the
+`std` in the order of `mtlnet.inference.prediction`; `out_of_distribution` 0 or 1; `absent` in the
 order of the distances; `to_lane_centre_m`, `angle_rad` and `heading` as in POST /features. The
 options of an image are those of POST /features, in headers, in the query, or in `parameters`.
 """
@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from mtlnet.inference.image_decoding.decode import check_size, decode_whole, read_header
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.prediction import Prediction
-from mtlnet.inference.uncertainty import FEATURES
+from mtlnet.inference.prediction import FEATURES, Prediction
 from serve.api.features import FrameHandler, ImageCamera
 from serve.api.kserve_tensors import (
     PAUSE_S,

@@ -14,10 +14,9 @@ from datagen.recording.folder import prepare, read_states, round_path
 from datagen.recording.integrity.round_checks import check_round
 from datagen.recording.integrity.verify import verify
 from datagen.recording.splits import Split, read_split, split_path, write_split
-from mtlnet.inference.engine import load_engine, openvino_core, read_export
+from mtlnet.inference.engine import load_engine, openvino_core, read_export, run_graph
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import GRAPH, MODEL_FILES, ModelError, check_files, read_card
-from mtlnet.openvino_graph import run_graph
 from runtime.files import file_hash
 from tests.chaos.process import Runner
 from tests.datagen.conftest import Samples

@@ -13,7 +13,7 @@ from mtlnet.data.loader import Loader
 from mtlnet.inference.engine import EngineKind, load_engine, openvino_core
 from mtlnet.inference.model_card import read_card
 from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
-from mtlnet.openvino_graph import TOLERANCE, build_graph
+from mtlnet.model.openvino_graph import TOLERANCE, build_graph
 from mtlnet.train import start_training
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.configure import new_config, resume_config

@@ -11,8 +11,7 @@ from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import Loader
 from mtlnet.data.model_labels import camera_scales, car_outputs, model_labels
 from mtlnet.data.road_ahead import lane_beside
-from mtlnet.inference.prediction import split_outputs
-from mtlnet.inference.uncertainty import COLUMNS
+from mtlnet.inference.prediction import COLUMNS, split_outputs
 from tests.mtlnet.conftest import HIGH_ROUNDS, write_dataset
 from trackfeatures.camera import CameraParameters
 

@@ -26,7 +26,7 @@ from mtlnet.evaluation.html_report import (
 )
 from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
-from mtlnet.inference.uncertainty import FEATURES
+from mtlnet.inference.prediction import FEATURES
 from tests.mtlnet.conftest import HIGH_CAMERA, HIGH_ROUNDS, write_dataset
 from tests.mtlnet.page import Page
 from trackfeatures.camera import CameraParameters

@@ -31,6 +31,7 @@ from mtlnet.inference.engine import (
     load_engine,
     openvino_core,
     read_graph,
+    run_graph,
     uses_int8,
 )
 from mtlnet.inference.model_card import (
@@ -42,10 +43,10 @@ from mtlnet.inference.model_card import (
     read_card,
     resolve_run,
 )
+from mtlnet.inference.torch_engine import convert_run, load_served
 from mtlnet.inference.trained_rounds import names_entry
-from mtlnet.inference.uncertainty import read_uncertainty_head
 from mtlnet.model.network import Network, fold, load_network
-from mtlnet.openvino_graph import TOLERANCE, build_graph, run_graph, write_graph
+from mtlnet.model.openvino_graph import TOLERANCE, build_graph, write_graph
 from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
 from tests.mtlnet.conftest import require_close
@@ -113,8 +114,8 @@ def test_an_openvino_model_answers_any_number_of_images_each_as_alone(
     """The shipped model, with its standard deviations and its score."""
     run = resolve_run("default")
     card = read_card(run)
-    network = load_network(run / WEIGHTS, card.network)
-    graph = build_graph(network, read_uncertainty_head(run), batch=-1)
+    module = load_served(run, card)
+    graph = build_graph(module.network, module.head, batch=-1)
     write_openvino(graph, tmp_path, precision)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     model = openvino_core().compile_model(str(tmp_path / GRAPH), "CPU", options)
@@ -155,9 +156,9 @@ def consumers(operation: Any) -> Any:
     return operation.output(0).get_target_inputs()
 
 
-def test_weights_that_stay_float_are_the_last_shared_layers_and_the_textures() -> None:
+def test_weights_that_stay_float_are_the_last_shared_layer_and_the_directions() -> None:
     run = resolve_run("default")
-    graph = read_graph(run, read_card(run))
+    graph = convert_run(run, read_card(run))
     products = operation_names(graph, "MatMul")
     sizes = {
         op.get_friendly_name(): list(op.get_output_shape(0))
@@ -190,7 +191,7 @@ def test_int8_is_the_default_once_it_passed_its_gate(
     rounding = [op for op in rounded_to if op.get_type_name() == "FakeQuantize"]
     readers = {i.get_node().get_type_name() for op in rounding for i in consumers(op)}
     assert len(rounding) == 3
-    assert readers <= {"Convolution", "MaxPool"}  # nothing from the heads
+    assert readers <= {"Convolution", "MaxPool", "Pad"}  # nothing from the heads
     reference = load_engine(run, precision="f32")(frame)
     quantised = load_engine(run, precision="int8")(frame)
     assert (quantised != reference).any()
@@ -334,7 +335,7 @@ def test_a_published_graph_is_on_the_disk_before_it_has_its_name(
     def record(path: Path) -> None:
         synced.append((path.name, sorted(found.name for found in tmp_path.iterdir())))
 
-    monkeypatch.setattr("mtlnet.openvino_graph.fsync_path", record)
+    monkeypatch.setattr("mtlnet.model.openvino_graph.fsync_path", record)
     write_graph(fold(Network()), tmp_path / "model.xml", tmp_path / "model.bin")
     staged, named = ["staged.bin", "staged.xml"], ["model.bin", "model.xml"]
     assert sorted(synced[:2]) == [("staged.bin", staged), ("staged.xml", staged)]

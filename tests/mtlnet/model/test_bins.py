@@ -9,7 +9,7 @@ import torch
 import trackfeatures as tf
 from mtlnet.architecture import ABSENT_ABOVE, ANGLE_BINS, DISTANCE_BINS, GRID, grid_size
 from mtlnet.export.convert import ONNX_FILE, check_export, write_onnx
-from mtlnet.inference.engine import openvino_core
+from mtlnet.inference.engine import openvino_core, run_graph
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
 from mtlnet.model.bins import (
     Scores,
@@ -21,7 +21,7 @@ from mtlnet.model.bins import (
     read_scores,
 )
 from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
-from mtlnet.openvino_graph import TOLERANCE, build_feature_graph, build_graph, run_graph
+from mtlnet.model.openvino_graph import TOLERANCE, build_feature_graph, build_graph
 from mtlnet.training.losses.bins import bins_loss
 from mtlnet.training.losses.multi_task import Losses
 from mtlnet.training.losses.task_weighting import TaskWeighting

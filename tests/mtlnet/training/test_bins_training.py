@@ -14,7 +14,7 @@ from mtlnet.data.road_ahead import RoadAhead
 from mtlnet.inference.engine import EngineKind, load_engine
 from mtlnet.inference.model_card import read_card
 from mtlnet.model.auxiliary import LABELS
-from mtlnet.openvino_graph import TOLERANCE
+from mtlnet.model.openvino_graph import TOLERANCE
 from mtlnet.train import start_training
 from mtlnet.training.recipes import RECIPES
 from mtlnet.training.trainer import Trainer

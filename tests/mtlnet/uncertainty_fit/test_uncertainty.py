@@ -1,29 +1,23 @@
 """The uncertainty head: standard deviations that match errors, and the OOD score."""
 
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
 from mtlnet.inference.engine import Precision, load_engine
 from mtlnet.inference.model_card import WEIGHTS, resolve_run
-from mtlnet.inference.prediction import OUTPUTS, decode_outputs, split_outputs
-from mtlnet.inference.uncertainty import (
-    CELL_VALUES,
-    FEATURES,
-    LIGHT_LIMIT,
-    LIGHT_VALUES,
-    UncertaintyHead,
-    light_features,
-    read_uncertainty_head,
-    standardise,
-    texture_features,
-)
+from mtlnet.inference.prediction import FEATURES, OUTPUTS, decode_outputs, split_outputs
+from mtlnet.inference.torch_engine import read_uncertainty_head
 from mtlnet.model.network import load_network
+from mtlnet.model.textures import CELL_VALUES, LIGHT_VALUES, light_features, texture_features
+from mtlnet.model.uncertainty_head import LIGHT_LIMIT, UncertaintyHead, standardise
 from mtlnet.uncertainty_fit.frame_outputs import FrameOutputs
 from mtlnet.uncertainty_fit.head import (
     fit_std_layers,
@@ -39,11 +33,23 @@ OOD_IMAGES = 1000
 ROOT = Path(__file__).parents[3]
 
 
+def textures_of(images: Iterable[np.ndarray]) -> np.ndarray:
+    """Texture features (N, C + M) of images."""
+    return np.stack([texture_features(torch.from_numpy(one[None]))[0].numpy() for one in images])
+
+
+def predict(head: UncertaintyHead, x: np.ndarray, textures: np.ndarray) -> np.ndarray:
+    """Standard deviations and OOD scores (N, D + 1)."""
+    found: np.ndarray = head(torch.from_numpy(x), torch.from_numpy(textures)).numpy()
+    return found
+
+
 def zero_pitch_layers() -> dict[str, np.ndarray]:
     """Pitch layers whose output is 0."""
-    shapes: dict[str, tuple[int, ...]] = {"centre": (0,), "scale": (0,)}
-    shapes |= {"hidden_weight": (1, 0), "hidden_bias": (1,), "weight": (1, 1), "bias": (1,)}
-    return {f"pitch_{name}": np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    shapes: dict[str, tuple[int, ...]] = {"_centre": (0,), "_scale": (0,)}
+    shapes |= {".first.weight": (1, 0), ".first.bias": (1,)}
+    shapes |= {".second.weight": (1, 1), ".second.bias": (1,)}
+    return {f"pitch{name}": np.zeros(shape, np.float32) for name, shape in shapes.items()}
 
 
 def fitted(
@@ -58,16 +64,15 @@ def fitted(
     error[rng.random(error.shape) < 0.2] = np.nan
     layers = fit_std_layers(x[:count], error[:count], 0, None)
     zero = np.zeros(1, np.float32)
-    head = UncertaintyHead(
-        np.zeros(6, np.float32), np.ones(6, np.float32), **layers,
-        texture_mean=zero, texture_directions=zero[None], **zero_pitch_layers(),
-    )  # fmt: skip
+    state = {"centre": np.zeros(6, np.float32), "scale": np.ones(6, np.float32), **layers}
+    state |= {"texture_mean": zero, "texture_directions": zero[None], **zero_pitch_layers()}
+    head = UncertaintyHead({name: torch.from_numpy(values) for name, values in state.items()})
     return head, x[count:], true[count:], error[count:]
 
 
 def test_known_standard_deviations_are_recovered() -> None:
     head, x, true, error = fitted(1, 3000, 3000)
-    std = head.predict(x, np.zeros((len(x), 1), np.float32))[:, :-1]
+    std = predict(head, x, np.zeros((len(x), 1), np.float32))[:, :-1]
     assert np.median(np.abs(np.log(std / true))) < 0.12
     for within in coverage(std, error).values():
         assert within[0] == pytest.approx(0.683, abs=0.04)
@@ -84,8 +89,8 @@ def test_both_shares_are_near_those_of_a_normal_distribution_despite_outliers() 
     x = rng.normal(size=(6000, 6)).astype(np.float32)
     error = (rng.standard_t(3, (6000, 7)) * np.exp(0.5 * x[:, :1] - 2)).astype(np.float32)
     layers = fit_std_layers(x[:3000], error[:3000], 0, None)
-    hidden = np.maximum(x[3000:] @ layers["hidden_weight"].T + layers["hidden_bias"], 0)
-    std = np.exp(hidden @ layers["weight"].T + layers["bias"])
+    hidden = np.maximum(x[3000:] @ layers["std.first.weight"].T + layers["std.first.bias"], 0)
+    std = np.exp(hidden @ layers["std.second.weight"].T + layers["std.second.bias"])
     for one, two in coverage(std, error[3000:]).values():
         assert one == pytest.approx(0.683, abs=0.05)
         assert two == pytest.approx(0.954, abs=0.05)
@@ -129,7 +134,7 @@ def test_texture_distance_has_the_given_false_alarm_rate() -> None:
 def test_texture_features_of_a_step_edge() -> None:
     image = np.zeros((210, 280, 3), np.uint8)
     image[:, 70:] = 255  # where the third of eight cell columns begins
-    features = texture_features(image)
+    features = textures_of([image])[0]
     cells = features[:CELL_VALUES].reshape(5, 14, 8)
     centre = features[CELL_VALUES:].reshape(5, 24, 4)
     assert cells[:3, :, :2] == pytest.approx(-1)
@@ -139,7 +144,7 @@ def test_texture_features_of_a_step_edge() -> None:
     assert cells[4] == pytest.approx(1e-3)
     assert centre[:3] == pytest.approx(1)
     image[:50] = 0  # up to the second band (5 rows) of the centre, which begins at row 45
-    centre = texture_features(image)[CELL_VALUES:].reshape(5, 24, 4)
+    centre = textures_of([image])[0, CELL_VALUES:].reshape(5, 24, 4)
     assert centre[0, 0] == pytest.approx(-1)
     assert centre[0, 1:] == pytest.approx(1)
     assert centre[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
@@ -149,7 +154,7 @@ def test_texture_features_of_a_step_edge() -> None:
 def test_the_light_of_an_image_is_told_of_each_half() -> None:
     image = np.full((210, 280, 3), 255, np.uint8)
     image[105:] = (0, 51, 102)
-    light = light_features(texture_features(image)[None]).reshape(5, 2)
+    light = light_features(torch.from_numpy(textures_of([image]))).numpy().reshape(5, 2)
     assert light[:3, 0] == pytest.approx(1)
     assert light[:3, 1] == pytest.approx([-1, -0.6, -0.2], abs=1e-5)
     assert light[3] == pytest.approx(1e-3)  # no edge across
@@ -173,26 +178,23 @@ def test_standard_deviations_follow_the_light_within_limits(
     assert len(head.centre) == features + LIGHT_VALUES
     image = frames.image(0)
     dimmed = [(image * factor).astype(np.uint8) for factor in (1.0, 0.9, 0.1)]
-    textures = np.stack([texture_features(each) for each in dimmed])
-    x = np.tile(head.centre[:features], (len(dimmed), 1))
-    day, dusk, night = np.log(head.predict(x, textures)[:, :-1])
+    textures = textures_of(dimmed)
+    x = np.tile(head.centre[:features].numpy(), (len(dimmed), 1))
+    day, dusk, night = np.log(predict(head, x, textures)[:, :-1])
     assert np.abs(day - dusk).max() > 1e-3
     assert np.abs(night - dusk).max() > 1e-3
-    far = standardise(
-        np.concatenate([x, 1e3 * light_features(textures)], 1), head.centre, head.scale, features
-    )
-    assert np.abs(far[:, features:]).max() == LIGHT_LIMIT
-    alike = few.predict(x, textures)[:, :-1]
+    light = 1e3 * light_features(torch.from_numpy(textures))
+    far = standardise(torch.cat([torch.from_numpy(x), light], 1), head.centre, head.scale, features)
+    assert far[:, features:].abs().max() == LIGHT_LIMIT
+    alike = predict(few, x, textures)[:, :-1]
     np.testing.assert_array_equal(alike, alike[:1].repeat(len(dimmed), 0))
 
 
 def test_images_without_a_road_are_out_of_distribution(published: Path) -> None:
     head = read_uncertainty_head(published)
-    kinds, textures = zip(
-        *((kind, texture_features(image)) for kind, image in images_without_road(OOD_IMAGES, 5)),
-        strict=True,
-    )
-    found = head.predict(np.zeros((OOD_IMAGES, 256), np.float32), np.stack(textures))[:, -1] > 1
+    kinds, images = zip(*images_without_road(OOD_IMAGES, 5), strict=True)
+    x = np.zeros((OOD_IMAGES, 256), np.float32)
+    found = predict(head, x, textures_of(images))[:, -1] > 1
     by_kind = Counter(kind for kind, ood in zip(kinds, found, strict=True) if ood)
     assert found.mean() > 0.98, by_kind
 
@@ -210,7 +212,7 @@ def test_the_graph_computes_the_score_of_the_texture(
     images += [image for _, image in images_without_road(6, 3)]
     assert len(images) > 10
     x = np.zeros((len(images), len(head.centre)), np.float32)
-    expected = head.predict(x, np.stack([texture_features(image) for image in images]))[:, -1]
+    expected = predict(head, x, textures_of(images))[:, -1]
     outputs = np.stack([engine(image) for image in images])
     assert split_outputs(outputs).ood_score == pytest.approx(expected, rel=tolerance)
 
@@ -238,15 +240,15 @@ def test_another_pitch_is_detected_with_its_sign(
 ) -> None:
     frames = Dataset.open(dataset).select("test")
     images = frames.read_batch(np.arange(len(frames)))
-    views = np.stack(
-        [texture_features(seen_by(i, CameraParameters(), fov_y_deg, pitch_deg)) for i in images]
-    )
+    views = [seen_by(image, CameraParameters(), fov_y_deg, pitch_deg) for image in images]
     head = read_uncertainty_head(published)
-    offset = head.pitch_offset(views[:, CELL_VALUES:])[:, 0]
+    offset, known = (
+        head.pitch_offset(torch.from_numpy(textures_of(seen)[:, CELL_VALUES:]))[:, 0].numpy()
+        for seen in (views, images)
+    )
     assert (offset**2 > 1).mean() > 0.9
     assert (np.sign(offset) == np.sign(pitch_deg)).mean() > 0.9
-    known = np.stack([texture_features(image) for image in images])
-    assert (np.abs(head.pitch_offset(known[:, CELL_VALUES:])) > 1).sum() <= 1
+    assert (np.abs(known) > 1).sum() <= 1
 
 
 def test_the_centre_of_a_drawn_view_lies_in_the_frame() -> None:

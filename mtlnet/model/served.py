@@ -1,0 +1,47 @@
+"""The network as it is served: everything that an answer holds, computed from uint8 images.
+
+The one definition of the served computation. The torch engine runs it, and the OpenVINO graph is
+converted from it (`mtlnet.model.openvino_graph`).
+"""
+
+import torch
+from torch import Tensor, nn
+
+from mtlnet.model.network import Network
+from mtlnet.model.textures import texture_features
+from mtlnet.model.uncertainty_head import UncertaintyHead
+
+
+class ServedNetwork(nn.Module):
+    """A folded network, its softmax, and its uncertainty head if it has one.
+
+    uint8 images (B, 210, 280, 3) -> float32 (B, 9 to 22); the columns are those of
+    `mtlnet.inference.prediction.split_outputs`.
+    """
+
+    def __init__(self, network: Network, head: UncertaintyHead | None = None) -> None:
+        super().__init__()
+        self.network, self.head = network, head
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = self.network.forward_features(images)
+        parts = [self.nine_outputs(x)]
+        if self.head is not None:
+            parts.append(self.head(self.network.uncertainty_inputs(x), texture_features(images)))
+        if self.network.architecture.bins:
+            parts.append(self.network.absent_probabilities(x))
+        return torch.cat(parts, 1)
+
+    def nine_outputs(self, x: Tensor) -> Tensor:
+        """Coded distances, coded angle and class probabilities (B, 9) for last shared features."""
+        outputs = self.network.forward_heads(x)
+        return torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
+
+
+class FitInputs(ServedNetwork):
+    """What the uncertainty head is fitted on: the nine outputs, the inputs of the head (B, X) and
+    the textures (B, C + M)."""
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+        x = self.network.forward_features(images)
+        return self.nine_outputs(x), self.network.uncertainty_inputs(x), texture_features(images)

@@ -1,0 +1,80 @@
+"""Texture features of an image: what the out-of-distribution score and the light are computed from.
+
+An image is divided into 14 x 8 cells of three bands each. A cell or a band has mean colours in
+[-1, 1], and the square roots of the mean absolute differences of brightness between horizontal and
+vertical neighbours. Torch operations without branches, so that they can be part of an exported
+network; B is the number of images, C = CELL_VALUES, M = CENTRE_VALUES.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+CELL_ROWS, CELL_COLUMNS = 14, 8
+BANDS = 3  # bands per cell; the pitch is predicted from the bands of the image centre
+CENTRE_BANDS, CENTRE_COLUMNS = slice(9, 33), slice(2, 6)
+COLOURS = 3
+PLANES = COLOURS + 2
+CELL_VALUES = PLANES * CELL_ROWS * CELL_COLUMNS
+CENTRE_VALUES = PLANES * 24 * 4
+TEXTURE_VALUES = CELL_VALUES + CENTRE_VALUES
+HALVES = 2  # upper and lower half of an image
+LIGHT_VALUES = PLANES * HALVES
+SQRT_EPSILON = 1e-6
+"""Added to a mean difference before the square root; the difference is 0 in a flat cell."""
+LEVEL = 1 / 127.5  # of a colour's step, where colours lie in [-1, 1]
+
+
+def texture_features(images: Tensor) -> Tensor:
+    """Texture features (B, C + M) of images uint8 (B, H, W, 3): of all cells, then of the bands of
+    the centre.
+
+    H and W must be multiples of the numbers of bands and columns.
+    """
+    sums, pixels = band_sums(images)
+    colours = sums[:, :COLOURS] * (LEVEL / pixels) - 1
+    differences = sums[:, COLOURS:] * (LEVEL / COLOURS / pixels)
+    narrow = torch.cat([colours, differences], 1)
+    cells = narrow.reshape(-1, PLANES, CELL_ROWS, BANDS, CELL_COLUMNS).mean(3)
+    centre = narrow[:, :, CENTRE_BANDS, CENTRE_COLUMNS]
+    return torch.cat([_with_roots(cells), _with_roots(centre)], 1)
+
+
+def band_sums(images: Tensor) -> tuple[Tensor, int]:
+    """Sums over each band (B, PLANES, bands, columns) of images uint8 (B, H, W, 3), and the number
+    of pixels of a band.
+
+    The planes are red, green, blue, and the absolute differences of red + green + blue from the
+    next column and from the next row; the last column and row differ by 0 from theirs. All sums are
+    of integers below 2**24, and therefore exact in float32.
+    """
+    colours = images.permute(0, 3, 1, 2)  # on bytes: faster than on floats
+    red, green, blue = (colours[:, k : k + 1].float() for k in range(COLOURS))
+    grey = red + green + blue
+    across = (pad(grey, (0, 1, 0, 0), mode="replicate")[..., 1:] - grey).abs()
+    down = (pad(grey, (0, 0, 0, 1), mode="replicate")[:, :, 1:] - grey).abs()
+    sums = torch.cat([_sums(plane) for plane in (colours.float(), across, down)], 1)
+    height, width = int(images.shape[1]), int(images.shape[2])
+    return sums, height // (CELL_ROWS * BANDS) * (width // CELL_COLUMNS)
+
+
+def _sums(planes: Tensor) -> Tensor:
+    """Sums over each band (B, N, bands, columns) of planes (B, N, H, W); not by a pool, which
+    OpenVINO computes on planes in blocks of 16."""
+    count, height, width = (int(size) for size in planes.shape[1:])
+    bands = CELL_ROWS * BANDS
+    rows = planes.reshape(-1, count, bands, height // bands, width).sum(3)
+    return rows.reshape(-1, count, bands, CELL_COLUMNS, width // CELL_COLUMNS).sum(4)
+
+
+def light_features(textures: Tensor) -> Tensor:
+    """Light features (B, LIGHT_VALUES) from textures (B, C + M): the mean of each texture plane
+    over the upper half, then over the lower half of the image."""
+    cells = textures[:, :CELL_VALUES].reshape(-1, LIGHT_VALUES, CELL_VALUES // LIGHT_VALUES)
+    return cells.mean(2)
+
+
+def _with_roots(planes: Tensor) -> Tensor:
+    """Values (B, N) of planes (B, PLANES, h, w), with the square roots of the differences."""
+    roots = torch.sqrt(planes[:, COLOURS:] + SQRT_EPSILON)
+    return torch.cat([planes[:, :COLOURS], roots], 1).flatten(1)
