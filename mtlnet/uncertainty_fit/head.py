@@ -97,8 +97,10 @@ def fit_uncertainty_head(
     torch.set_num_threads(1)  # the head is small, and more threads are slower
 
     def standardised(x: NDArray[np.float32]) -> NDArray[np.float32]:
-        tensors = (torch.from_numpy(each) for each in (x, centre, scale))
-        found: NDArray[np.float32] = standardise(*tensors, count=count).numpy()
+        tensor = torch.from_numpy
+        found: NDArray[np.float32] = standardise(
+            tensor(x), tensor(centre), tensor(scale), count
+        ).numpy()
         return found
 
     known_z = standardised(known.x)
