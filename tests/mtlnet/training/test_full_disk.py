@@ -17,8 +17,9 @@ from mtlnet.train import train
 from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.configure import resume_config
-from mtlnet.training.logging import CurveLog, TensorBoardWriter
+from mtlnet.training.logging import CurveLog
 from runtime.files import atomic_write
+from runtime.tensorboard import TensorBoardWriter
 from trackfeatures.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("small_network", "short_fit")
