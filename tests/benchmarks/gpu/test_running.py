@@ -37,6 +37,7 @@ def task_of(folder: Path) -> Run:
     return Run(Plan(3.0), REHEARSAL, kept, time.monotonic(), "continue", None)
 
 
+@pytest.mark.alone
 def test_stages_know_until_when_they_may_take_and_none_begins_after_the_end(
     tmp_path: Path,
 ) -> None:

@@ -114,6 +114,7 @@ def test_room_is_asked_of_the_worker_with_the_most_connections_once() -> None:
     assert WorkerPeers(memory, 0).room_asked() is None  # a restarted worker in this block
 
 
+@pytest.mark.alone
 def test_many_connections_at_once_are_accepted_one_after_the_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -135,7 +135,7 @@ def status_of_child(work: Any) -> int:
             status = 0
         finally:
             os._exit(status)
-    timer = threading.Timer(30.0, os.kill, (child, 9))
+    timer = threading.Timer(240.0, os.kill, (child, 9))
     timer.start()
     _, status = os.waitpid(child, 0)
     timer.cancel()

@@ -57,6 +57,7 @@ def assert_equal(one: Any, other: Any, path: str = "") -> None:
         np.testing.assert_array_equal(one, other, err_msg=path, strict=isinstance(one, np.ndarray))
 
 
+@pytest.mark.contacts
 @pytest.mark.parametrize(
     ("steps", "longest"), [(120, 50), pytest.param(2000, 700, marks=pytest.mark.extended)]
 )
