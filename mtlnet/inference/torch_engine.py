@@ -47,7 +47,7 @@ class TorchEngine:
 
     def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Outputs (B, 9) to (B, 22) for images (B, H, W, 3)."""
-        device = "cuda" if self.on_gpu else "cpu"
+        device = next(self.served.parameters()).device
         with torch.inference_mode():
             parts = [
                 self.served(torch.from_numpy(images[first : first + RUN_BATCH]).to(device)).cpu()
