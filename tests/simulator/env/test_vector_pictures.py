@@ -229,7 +229,7 @@ def test_workers_end_with_their_process(fate: signal.Signals, tmp_path: Path) ->
     [
         ({"workers": 0}, "^workers is 0; give a whole number of 1 or more"),
         ({"workers": 1.5}, "^workers is 1.5"),
-        ({"light": ["clear", "fog", "clear"]}, "^car 1: .*fog"),
+        ({"light": ["clear", "moonlight", "clear"]}, "^car 1: .*moonlight"),
         ({"light_seed": [1, 2]}, "^light_seed is a list of 2 for 3 cars"),
         ({"views": ("front", "sideways")}, "unknown camera view 'sideways'"),
     ],
