@@ -159,7 +159,7 @@ def test_the_standard_deviation_has_a_least_value() -> None:
     states = RNG.normal(size=(8, 7)).astype(np.float32)
     step = step_of(states, RNG.normal(size=8), np.zeros(8, np.bool_))
     figures = ppo.learn(states, RNG.normal(size=8).astype(np.float32), step, RNG, 1.0)
-    assert figures["std"] == pytest.approx(0.05)
+    assert figures["std"] == pytest.approx(0.05, rel=0.02)
 
 
 def test_the_rates_fall_linearly() -> None:
