@@ -158,7 +158,7 @@ def test_the_standard_deviation_has_a_least_value() -> None:
     ppo = Ppo(replace(PpoSettings(), horizon=1, minibatches=1, first_std=0.01), PAPER, 8, 0)
     states = RNG.normal(size=(8, 7)).astype(np.float32)
     step = step_of(states, RNG.normal(size=8), np.zeros(8, np.bool_))
-    figures = ppo.learn(states, RNG.normal(size=8).astype(np.float32), step, RNG, 1.0)
+    figures = ppo.learn(states, ppo.explore(states, RNG), step, RNG, 1.0)
     assert figures["std"] == pytest.approx(0.05, rel=0.02)
 
 
