@@ -94,14 +94,14 @@ class PpoSettings:
     epochs: int = 4
     minibatches: int = 8
     clip: float = 0.2
-    actor_rate: float = 1e-3
-    critic_rate: float = 1e-3
+    actor_rate: float = 3e-3
+    critic_rate: float = 3e-3
     rate_end: float = 0.0
     """Share of the learning rates that is left at the last step; they fall linearly."""
     max_gradient: float = 0.5
     """Largest norm of the gradient, of the actor and of the critic."""
     first_std: float = 0.14
-    """Standard deviation of the first steering actions; it is learned."""
+    """Standard deviation of the first steering actions; it is learned, and 0.05 at least."""
     state_noise: float = 0.0
     """Standard deviation of the noise on the paper's state."""
     reward_baseline: float = 1.0

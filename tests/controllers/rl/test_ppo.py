@@ -154,6 +154,14 @@ def test_a_cut_episode_continues_with_the_value_of_its_last_state() -> None:
     assert found[2] == pytest.approx(of_last[2].numpy(), abs=1e-6)
 
 
+def test_the_standard_deviation_has_a_least_value() -> None:
+    ppo = Ppo(replace(PpoSettings(), horizon=1, minibatches=1, first_std=0.01), PAPER, 8, 0)
+    states = RNG.normal(size=(8, 7)).astype(np.float32)
+    step = step_of(states, RNG.normal(size=8), np.zeros(8, np.bool_))
+    figures = ppo.learn(states, ppo.explore(states, RNG), step, RNG, 1.0)
+    assert figures["std"] == pytest.approx(0.05, rel=0.02)
+
+
 def test_the_rates_fall_linearly() -> None:
     ppo = Ppo(
         replace(PpoSettings(), horizon=1, minibatches=1, actor_rate=1e-3, critic_rate=4e-3),
