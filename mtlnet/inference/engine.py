@@ -131,8 +131,8 @@ def _read_model(graph: Path) -> Any:
 
 
 def read_graph(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run: its stored graph. A run that was written where OpenVINO was
-    missing has none; its weights are converted, which needs torch.
+    """The OpenVINO model of a run: its stored graph. A run that was written without OpenVINO or
+    by an earlier `mtlnet ship` has none; its weights are converted, which needs torch.
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
     """
@@ -141,8 +141,8 @@ def read_graph(run: Path, card: ModelCard) -> Any:
         return _read_model(run / GRAPH)
     if find_spec("torch") is None:
         raise ModelError(
-            f"{run} has no graph ({GRAPH}), because it was written where OpenVINO is not "
-            f"installed; `mtlnet ship --model {run} --out FOLDER` writes a model with a graph, "
+            f"{run} has no graph ({GRAPH}): it was written without OpenVINO or by an earlier "
+            f"`mtlnet ship`; `mtlnet ship --model {run} --out FOLDER` writes a model with a graph, "
             "where torch and OpenVINO are installed"
         )
     from mtlnet.inference.torch_engine import convert_run

@@ -4,10 +4,13 @@
 """
 
 import os
+import shutil
 import subprocess
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -22,7 +25,13 @@ from mtlnet.data.custom_images import COLUMNS, open_custom_images
 from mtlnet.evaluation.protocol import drive_rows
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import inspect, read_image
-from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.model_card import (
+    SHIPPED,
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
+    read_card,
+    resolve_run,
+)
 from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import fit_markings
@@ -192,6 +201,16 @@ TRIES: dict[str, Try] = {
     ),
     "weights of the loss": lambda folder: parse_alpha("0.3,-1,0.5"),
 }
+
+
+@add_to(TRIES, "a run without a graph")
+def _(folder: Path) -> object:
+    run = shutil.copytree(SHIPPED, folder / "run")
+    card = read_card(run)
+    files = {name: card.files[name] for name in (WEIGHTS, UNCERTAINTY_WEIGHTS)}
+    replace(card, files=files).write(run)
+    with mock.patch("mtlnet.inference.engine.find_spec", return_value=None):
+        return load_engine(run, "openvino", "f32")
 
 
 @add_to(TRIES, "a film in which FFmpeg")
