@@ -240,6 +240,13 @@ def test_the_command_trains_and_drives(tmp_path: Path) -> None:
         (("--track", "nowhere"), "no track 'nowhere'"),
         (("--state-noise", "-1"), "noise is -1"),
         (("--actor-rate", "0"), "learning rate 0.0"),
+        (("--algorithm", "ppo", "--state", "residual"), "--state residual needs --envs 1"),
+        (("--algorithm", "td3", "--envs", "8", "--state", "stacked"), "--state stacked needs"),
+        (("--track", "all"), "--track all needs several cars"),
+        (("--algorithm", "ppo", "--envs", "2", "--track", "nowhere"), "no track 'nowhere'"),
+        (("--algorithm", "ppo", "--actor-rate", "nan"), "learning rate nan"),
+        (("--algorithm", "ppo", "--state-noise", "-1", "--track", "oval"), "noise is -1"),
+        (("--resume",), "run holds no training"),
     ],
 )
 def test_a_wrong_option_is_one_error_line(

@@ -151,27 +151,6 @@ def test_the_command_continues_with_the_stored_options(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["steps"] == 3 * UPDATE
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--algorithm", "ppo", "--state", "residual"), "--state residual needs --envs 1"),
-        (("--algorithm", "td3", "--envs", "8", "--state", "stacked"), "--state stacked needs"),
-        (("--track", "all"), "--track all needs several cars"),
-        (("--algorithm", "ppo", "--envs", "2", "--track", "nowhere"), "no track 'nowhere'"),
-        (("--algorithm", "ppo", "--actor-rate", "nan"), "learning rate nan"),
-        (("--algorithm", "ppo", "--state-noise", "-1", "--track", "oval"), "noise is -1"),
-        (("--resume",), "run holds no training"),
-    ],
-)
-def test_a_wrong_option_is_one_error_line(
-    tmp_path: Path, words: tuple[str, ...], message: str
-) -> None:
-    done = typed("controllers", "train", "--out", tmp_path / "run", *words)
-    assert done.returncode == 1
-    assert message in error_line(done)
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("words", [("--envs", "0"), ("--disturbed", "1.5"), ("--threads", "0")])
 def test_numbers_out_of_range_are_refused(words: tuple[str, ...]) -> None:
     done = typed("controllers", "train", *words)
