@@ -93,13 +93,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or leave it out')
         given = {"track": track, "lanes": lanes} | options
-        listed, own = _lists({name: given[name] for name in PER_CAR if name in given}, num_envs)
-        shared = {name: value for name, value in given.items() if name not in PER_CAR} | own
-        if isinstance(shared.get("start"), Mapping):
-            starts, start = _lists(dict(shared["start"]), num_envs)
-            if starts:
-                listed["start"] = [start | own for own in _of_each_car(starts, num_envs)]
-                del shared["start"]
+        listed, shared = _options_by_car(given, num_envs)
         looks = {name: listed.pop(name) for name in LOOK if name in listed}
         drive, episode, observation, picture = split_options(shared)
         observation = observation.resolved(self.kind)
@@ -298,6 +292,20 @@ def _with_lists(shared: Options, listed: dict[str, list[Any]], count: int) -> li
 
 def _of_each_car(listed: dict[str, list[Any]], count: int) -> list[dict[str, Any]]:
     return [{name: values[k] for name, values in listed.items()} for k in range(count)]
+
+
+def _options_by_car(
+    given: dict[str, Any], count: int
+) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+    """The options that are lists with a value for each of `count` cars, and those of all cars."""
+    listed, own = _lists({name: given[name] for name in PER_CAR if name in given}, count)
+    shared = {name: value for name, value in given.items() if name not in PER_CAR} | own
+    if isinstance(shared.get("start"), Mapping):
+        starts, start = _lists(dict(shared["start"]), count)
+        if starts:
+            listed["start"] = [start | own for own in _of_each_car(starts, count)]
+            del shared["start"]
+    return listed, shared
 
 
 def _lists(given: dict[str, Any], count: int) -> tuple[dict[str, list[Any]], dict[str, Any]]:
