@@ -1,0 +1,91 @@
+"""The search for parameters of controllers."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controllers.compare.config import TuneConfig
+from controllers.compare.tune import evaluate, propose, tune
+from controllers.drive.config import DriveConfig
+from controllers.drive.disturbance import DISTURBANCES
+from controllers.drive.run import drive, read_parameters
+from simulator.track.catalogue import find_track
+from trackfeatures import UserError
+
+
+def test_the_search_finds_better_parameters_and_is_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reward that falls with the distance from 1 in log space replaces the drives."""
+    counted = []
+
+    def evaluate(config: TuneConfig, controller: str, parameters: dict[str, float]) -> float:
+        counted.append(parameters)
+        if not parameters:
+            return -10.0
+        return -sum(abs(math.log(value)) for value in parameters.values())
+
+    monkeypatch.setattr("controllers.compare.tune.evaluate", evaluate)
+    config = TuneConfig(
+        out=tmp_path / "tuned.json", controllers="lqr,mpc", tracks="oval", budget=60
+    )
+    content = tune(config)
+    assert len(counted) == 120
+    assert tune(config) == content
+    assert len(counted) == 120
+    for name in ("lqr", "mpc"):
+        found = content["controllers"][name]
+        assert found["untuned"] == -10.0
+        explored = max(one["reward"] for one in found["tried"][:21])
+        assert found["reward"] > max(explored, -5.0)
+        assert read_parameters(config.out, name) == found["parameters"]
+    with pytest.raises(UserError, match="other settings"):
+        tune(replace(config, seed=1))
+
+
+def test_the_reward_of_a_candidate_is_the_mean_of_single_drives() -> None:
+    config = TuneConfig(tracks="oval,town", steps=60, seed=2, disturbance="noise")
+    alone = [
+        drive(
+            DriveConfig("lqr", name, steps=60, seed=2, start_d=-find_track(name).width / 6),
+            disturbance=DISTURBANCES["noise"],
+            parameters={"rho": 0.1},
+        ).score_per_step
+        for name in ("oval", "town")
+    ]
+    assert evaluate(config, "lqr", {"rho": 0.1}) == np.mean(alone)
+
+
+def test_candidates_stay_within_their_ranges() -> None:
+    ranges = {"a": (0.1, 10.0)}
+    rng = np.random.default_rng(0)
+    tried: list[dict[str, Any]] = []
+    for _ in range(50):
+        parameters = propose(ranges, tried, 50, rng)
+        tried.append({"parameters": parameters, "reward": sum(parameters.values())})
+    assert tried[0]["parameters"] == {}
+    assert all(0.1 <= one["parameters"]["a"] <= 10.0 for one in tried[1:])
+    assert tried[-1]["parameters"]["a"] > 5.0  # near the best, at the end
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"controllers": "torcs"}, "'torcs' cannot be tuned; use some of: lqr"),
+        ({"reward": "speed"}, "no reward 'speed'"),
+        ({"budget": 0}, "budget of 0"),
+        ({"disturbance": "storm"}, "no disturbance 'storm'"),
+        ({"tracks": "oval,nowhere", "budget": 1, "steps": 20, "controllers": "lqr"}, "nowhere"),
+    ],
+)
+def test_a_wrong_search_is_refused_before_its_first_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr("controllers.compare.tune.drive_many", lambda *_: pytest.fail("driven"))
+    with pytest.raises(UserError, match=message):
+        tune(TuneConfig(out=tmp_path / "tuned.json", **changes))
+    assert not (tmp_path / "tuned.json").exists()
