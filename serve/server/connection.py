@@ -164,6 +164,14 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_with(head_too_large())
         if self._settled is not self._phase:
             self._settle()
+        if len(data) >= guards.PAUSE_BYTES and not self.flow.read_paused:
+            self.flow.pause_reading()
+            self.loop.call_soon(self._read_on)
+
+    def _read_on(self) -> None:
+        """Read again after PAUSE_BYTES, unless something else has paused reading meanwhile."""
+        if not (self.transport.is_closing() or self.flow.write_paused or self.guard.holds(self)):
+            self.flow.resume_reading()
 
     def feed(self, data: bytes) -> int | None:
         """Parse `data`. Returns the offset after the headers of a request with an upgrade, or None

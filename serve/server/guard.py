@@ -24,6 +24,9 @@ LINGER_S = 0.5  # time for a client to read the problem before its connection is
 DRAIN_S = 1.0  # time for clients to send one more request, answered with Connection: close
 EVICTABLE_S = 0.1  # headers or a body that take longer are ended in favour of new connections
 REFUSAL_PAUSE_S = 0.002  # pause in reading from refused clients while the queue is full
+# libuv reads one connection up to 32 times in a row, and 2 MB of frames or chunks take 20 ms to
+# parse. So reading pauses after a read of this size until the event loop has run its other work.
+PAUSE_BYTES = 32 << 10
 
 
 class Guarded(Protocol):
@@ -201,6 +204,10 @@ class ConnectionGuard:
             connection.loop.call_later(REFUSAL_PAUSE_S, self._resume_reading)
         connection.flow.pause_reading()
         self.paused.append(connection)
+
+    def holds(self, connection: HttpToolsProtocol) -> bool:
+        """Whether `pause_reading` was called for the connection, and its time is not over."""
+        return connection in self.paused
 
     def _resume_reading(self) -> None:
         paused, self.paused = self.paused, []

@@ -107,6 +107,14 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self._message_end_s = self._guard.clock() + self._guard.limits.body_s
         if not self._discarding:
             self._count_message()
+            if len(data) >= guards.PAUSE_BYTES and self.transport.is_reading():
+                self.transport.pause_reading()
+                self.loop.call_soon(self._read_on)
+
+    def _read_on(self) -> None:
+        """Read again after PAUSE_BYTES, unless something else has paused reading meanwhile."""
+        if not (self.read_paused or self.transport.is_closing()):
+            self.transport.resume_reading()
 
     def _count_message(self) -> None:
         """Reserve the received bytes of messages in the budget for bodies."""
