@@ -26,7 +26,7 @@ from simulator.env.reward import OFF_TRACK_REWARD
 from simulator.track.catalogue import find_track, list_tracks
 from trackfeatures.errors import UserError
 
-EVALUATION_STEPS = 2000
+EVALUATION_STEPS = 6500
 """Steps of an evaluation's drive on each track, from TORCS's place on the grid."""
 HALF_WIDTH_M = 5.5
 """Divisor of the offset in a training on all tracks: half the width of forza."""
