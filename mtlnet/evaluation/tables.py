@@ -140,12 +140,10 @@ def uncertainty_table(result: dict[str, Any]) -> Table:
 
 def prediction_table(predictions: list[dict[str, Any]]) -> Table:
     """The track features predicted for images."""
-    table = Table(title="track features")
+    table = Table(title="track features (m, rad)", box=None, padding=(0, 0, 0, 1))
     table.add_column("image", overflow="fold")
-    for m in tf.MARKINGS:
-        table.add_column(f"{m} (m)", justify="right")
-    for column in ("to lane centre (m)", "angle (rad)", "heading"):
-        table.add_column(column, justify="right", min_width=7)
+    for column in (*tf.MARKINGS, "to lane centre", "angle", "heading"):
+        table.add_column(column, justify="right", no_wrap=True)
     for prediction in predictions:
         heading = max(prediction["heading"], key=prediction["heading"].__getitem__)
         table.add_row(
