@@ -55,7 +55,7 @@ def snapshot(
     roads: Annotated[
         str, typer.Option(help="paper, or varied: random lanes, paint and look, by --seed.")
     ] = "paper",
-    seed: Annotated[int, typer.Option(help="Seed of scenery, light and places.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of scenery, light and viewpoints.", min=0)] = 0,
     traffic: Traffic = 3,
     light: Annotated[
         str | None, typer.Option(help="Kind of light, such as rain. Default: all, in turn.")

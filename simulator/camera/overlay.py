@@ -40,8 +40,8 @@ def marking_polylines(
     ahead_m: float = 60.0,
     view: str = "front",
 ) -> list[FloatArray]:
-    """Pixel polylines (n, 2) of the centres of the true markings, leftmost first; of a double line
-    the one nearer to the car's lane.
+    """Pixel polylines (n, 2) of the centres of the true markings, leftmost first; for a double
+    line, of the line nearer to the car's lane.
 
     `at` is (s, body pose) of the car, or its state. Each line runs from just behind the eye to
     `ahead_m`; points behind the camera or far outside the image are cut off. Occlusion by hills is

@@ -65,13 +65,13 @@ def write_contact_sheet(
     kind: str = COLOUR,
     camera: CameraParameters | None = None,
 ) -> None:
-    """Write a PNG of views at places all round `road`.
+    """Write a PNG of views at points all round `road`.
 
     All pictures show `view`; without it, driver views, one chase view and one top view. All are in
     the light of kind `light`; without it, every other picture is in clear light and the rest cycle
     through the other kinds. With `kind` "colour" the right half has the true markings drawn thinly
     over the painted ones; "depth" and "class" are in false colours. `camera` is the lens, scaled to
-    WIDTH; without it, the driver camera, on a varied road at the height drawn for that road. On a
+    WIDTH; without it, the driver camera, on a varied road at the random height of that road. On a
     varied road each light has a look of its own. An older file is kept until the new one is
     complete. Raises UserError if the file is not a PNG, its folder does not exist, or light, view
     or kind is unknown; OSError if it cannot be written.
@@ -106,7 +106,7 @@ def write_contact_sheet(
 
 def _lens(road: Road, camera: CameraParameters | None) -> CameraParameters:
     """The camera of a sheet: `camera` scaled to WIDTH, or else the driver camera, on a varied road
-    at the height drawn for that road."""
+    at the random height of that road."""
     if camera is not None:
         return camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
     lens = CameraParameters(WIDTH, HEIGHT)

@@ -1,6 +1,6 @@
 """Built-in driver: keeps its lane, slows down for bends, and keeps its distance to the car ahead.
 
-Steering by `lateral_law`, pedals by `speed.SpeedControl`. Track frame, left positive.
+`lateral_law` computes the steering, `speed.SpeedControl` the pedals. Track frame, left positive.
 """
 
 from typing import Final

@@ -28,7 +28,8 @@ INTEGRAL_LIMIT = 1.0  # m/s2
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Speed limit (m/s) in cells along the lap: of the bends, and of braking before them."""
+    """Speed limit (m/s) in cells along the lap, which allows for the bends and for braking before
+    them."""
 
     limit: NDArray[np.float64]
     cell_m: float
@@ -45,7 +46,8 @@ def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProf
 
 
 def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
-    """Speed limit by the bends alone; `innermost_y` as for `speed_profile`."""
+    """The speed profile without a desired speed: only bends, and braking before them, limit the
+    speed. `innermost_y` as for `speed_profile`."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)

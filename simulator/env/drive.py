@@ -1,4 +1,5 @@
-"""The episodes of one car: each draws its road, car and start from the car's own generator."""
+"""The episodes of one car: the road, car and start of each episode are random numbers of the car's
+own generator."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -43,7 +44,7 @@ class RoadShop:
 class Drive:
     """The world of car `number` of `fleet`; `reset` begins an episode.
 
-    `world` is another object after a reset that drew another road or car.
+    A reset that chooses another road or car replaces the object `world`.
     """
 
     def __init__(self, options: DriveOptions, fleet: Fleet, number: int, roads: RoadShop) -> None:
@@ -68,9 +69,9 @@ class Drive:
         return episode
 
     def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The start of an episode with the `given` options of `reset`, before anything is drawn.
-        Raises UserError for an unknown option, a value that is no number, and a place that is not
-        on the road; a road that is still to be drawn may be narrower."""
+        """The start of an episode with the `given` options of `reset`, before any random choice.
+        Raises UserError for an unknown option, a value that is no number, and a start that is not
+        on the road. The random road of the episode is not known yet and may be narrower."""
         start = {**self._options.start, **given}
         ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
         for end in (0, 1):

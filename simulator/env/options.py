@@ -22,7 +22,7 @@ from simulator.world.control_rate import check_frequency
 from trackfeatures.errors import UserError
 
 Setting = float | tuple[float, float]
-"""A number, or the range (least, greatest) from which each episode draws one."""
+"""A number, or a range (least, greatest) of which each episode gets a random number."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class DriveOptions:
 
     lanes: int | tuple[int, int] = 1
     lane_width: Setting | None = None
-    """m; a number drawn from a range is rounded to 0.1 m. None: 4.0, or the width drawn for a
-    varied road."""
+    """m; a random number of a range is rounded to 0.1 m. None: 4.0, or the random width of a varied
+    road."""
     roads: str = "paper"
-    """"varied": lane width, shoulders and lines are drawn from `road_seed`, the look from
+    """"varied": lane width, shoulders and lines are random by `road_seed`, the look by
     `light_seed`."""
     road_seed: int = 0
     traffic: int = 0
@@ -86,7 +86,8 @@ class DriveOptions:
             ends_of(name, setting)
 
     def car(self, rng: np.random.Generator | None) -> CarParameters:
-        """The car of an episode; `rng` draws from ranges, None takes their least values."""
+        """The car of an episode. Values of ranges are random numbers of `rng`; without `rng` they
+        are the least values."""
         friction, mass = draw(self.friction, rng), draw(self.mass, rng)
         car = CarParameters()
         if friction == mass == 1.0:
@@ -126,7 +127,8 @@ def split_options(
 
 
 def draw(setting: Any, rng: np.random.Generator | None) -> Any:
-    """The number of a setting: itself, or one drawn from its range, the least without `rng`."""
+    """The number of a setting: the number itself, or a random number of the range (its least value
+    without `rng`)."""
     if not isinstance(setting, tuple):
         return setting
     return setting[0] if rng is None else float(rng.uniform(*setting))

@@ -64,7 +64,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     which the next `step` or `reset` overwrites.
 
     Raises UserError for bad options and actions; its message names the car, and no car has moved.
-    Raises PictureWorkerError when a worker dies; `reset` starts others.
+    Raises PictureWorkerError when a worker dies; `reset` starts new workers.
     """
 
     kind: ClassVar[Kind] = "state"
@@ -138,9 +138,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         seed: Seeds = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode of each car, or of those of `options["reset_mask"]` (N,) bool. The other
-        options are those of a single environment; each is a number, a list with one for each car,
-        or a range (least, greatest)."""
+        """Begin an episode of each car, or of each car in the mask `options["reset_mask"]` (N,)
+        bool. The other options are the options of a single environment; each is a number, a list
+        with one for each car, or a range (least, greatest)."""
         if self.closed:
             raise UserError("this environment is closed; make a new one")
         given = reset_options(options)
@@ -162,8 +162,8 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def step(
         self, actions: Any
     ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Advance all cars by a control step; those whose episode is over are reset as the
-        autoreset mode says."""
+        """Advance all cars by a control step; cars whose episode is over are reset according to the
+        autoreset mode."""
         self._check_running()
         moving = ~self._over
         rows = to_rows(actions, self._controls, moving)
@@ -297,7 +297,8 @@ def _of_each_car(listed: dict[str, list[Any]], count: int) -> list[dict[str, Any
 def _options_by_car(
     given: dict[str, Any], count: int
 ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-    """The options that are lists with a value for each of `count` cars, and those of all cars."""
+    """The options that are lists with a value for each of `count` cars, and the options with one
+    value for all cars."""
     listed, own = _lists({name: given[name] for name in PER_CAR if name in given}, count)
     shared = {name: value for name, value in given.items() if name not in PER_CAR} | own
     if isinstance(shared.get("start"), Mapping):
@@ -309,7 +310,8 @@ def _options_by_car(
 
 
 def _lists(given: dict[str, Any], count: int) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-    """The entries of `given` that are lists with one value for each car, and the others."""
+    """The entries of `given` that are lists with one value for each car, and the entries that are
+    not."""
     listed, shared = {}, {}
     for name, value in given.items():
         if isinstance(value, np.ndarray):

@@ -1,4 +1,5 @@
-"""The `info` of a vector environment, as Gymnasium's vectors build it from that of each car."""
+"""The `info` of a vector environment, as Gymnasium's vectors build it from the `info` of each
+car."""
 
 import math
 from typing import Any

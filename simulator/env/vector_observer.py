@@ -58,7 +58,8 @@ class VectorObserver:
         self._observers[number].restart(episode)
 
     def observe(self, chosen: NDArray[np.bool_]) -> Any:
-        """The observations of all cars; those of the `chosen` ones (N,) are new."""
+        """The observations of all cars; only the observations of the `chosen` cars (N,) are
+        computed anew."""
         kind: Kind | None = self._first.kind
         if kind == "state":
             return self._cars.states.copy()
@@ -85,7 +86,8 @@ class VectorObserver:
         return pictures.copy() if self._copy else pictures
 
     def _read_sensors(self, numbers: Sequence[int]) -> dict[str, NDArray[Any]]:
-        """Each sensor's readings (N, ...) of all cars; those of cars `numbers` are new."""
+        """Each sensor's readings (N, ...) of all cars; only the readings of cars `numbers` are
+        computed anew."""
         if self._first.batched:
             return {
                 sensor.name: sensor.limit(self._cars.beams).astype(sensor.dtype)

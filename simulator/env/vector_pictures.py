@@ -15,7 +15,8 @@ from simulator.world.world import World
 
 
 class VectorPictures:
-    """Draws the `views` of `cars`, each at most once per state; `options`: those of each car."""
+    """Draws the `views` of `cars`, each at most once per state; `options`: the picture options of
+    each car."""
 
     def __init__(
         self, cars: Cars, options: Sequence[RenderOptions], views: Iterable[str], workers: int
@@ -33,8 +34,8 @@ class VectorPictures:
     def draw(self, views: Sequence[str], chosen: Iterable[int]) -> None:
         """Draw the views of the current state of the cars `chosen` that are not drawn yet.
 
-        Raises PictureWorkerError when a worker dies; the next `draw` starts others. New workers
-        draw all cars: their memory is empty.
+        Raises PictureWorkerError when a worker dies; the next `draw` starts new workers. New
+        workers draw all cars: their memory is empty.
         """
         if not self._pool.running:
             self.close()
@@ -60,7 +61,7 @@ class VectorPictures:
         return self._pool.pictures(view)
 
     def close(self) -> None:
-        """End the workers; the next `draw` starts others."""
+        """End the workers; the next `draw` starts new ones."""
         self._pool.close()
         self._drawn = {view: [None] * len(self._options) for view in self._pool.views}
 

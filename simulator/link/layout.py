@@ -107,7 +107,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Block:
-    """A C struct; `offset` is its place in the segment, bytes."""
+    """A C struct; `offset` is its position in the segment, bytes."""
 
     name: str
     meaning: str
@@ -159,7 +159,7 @@ def segment_size(width: int, height: int) -> int:
 
 
 def layout_hash() -> int:
-    """64 bits over all names, types, counts, places and enumerations."""
+    """A hash of 64 bits over all names, types, counts, offsets and enumerations."""
     parts = [f"{block.name}@{block.offset}" for block in BLOCKS]
     parts += [f"{f.name}:{f.kind}x{f.count}" for block in BLOCKS for f in block.fields]
     parts += [f"{kind.__name__}.{m.name}={m.value}" for kind in ENUMS for m in kind]

@@ -234,7 +234,7 @@ def try_lock(descriptor: int, role: Role) -> bool:
 
 
 def _is_named(name: str, descriptor: int) -> bool:
-    """Whether `name` still leads to the segment that is open as `descriptor`."""
+    """Whether `name` is still the name of the segment that is open as `descriptor`."""
     try:
         current = _open_name(name, os.O_RDONLY)
     except FileNotFoundError:

@@ -108,7 +108,8 @@ def picture_sensor(
 
 
 def sensors_of(chosen: Iterable[str | Sensor]) -> tuple[Sensor, ...]:
-    """Sensors given by their name in STANDARD, or as they are. Raises UserError for others."""
+    """The sensors `chosen`; a name stands for the sensor of this name in STANDARD. Raises UserError
+    for an unknown name."""
     return tuple(sensor if isinstance(sensor, Sensor) else _named(sensor) for sensor in chosen)
 
 

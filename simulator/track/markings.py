@@ -24,7 +24,8 @@ class MarkingStyle:
 
 
 def imported_style(name: str, *, kerbs: bool) -> MarkingStyle:
-    """A style drawn from the name of a track, for files without information on paint."""
+    """A random style whose seed is the name of the track, for files without information on
+    paint."""
     draw = hashlib.sha256(name.encode()).digest()
     dash_length, dash_gap = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))[draw[1] % 4]
     return MarkingStyle(

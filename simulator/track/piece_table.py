@@ -62,7 +62,7 @@ def centre_point(table: Table, index: int, along: float) -> tuple[float, float]:
 
 @compiled
 def complete_table(table: Table) -> None:
-    """Fill the columns that are computed from others."""
+    """Fill the columns that are computed from other columns."""
     for index in range(table.shape[0]):
         row = table[index]
         row[COS0], row[SIN0] = math.cos(row[HEADING0]), math.sin(row[HEADING0])

@@ -54,7 +54,7 @@ class Lap:
 
 
 def sample(road: Road) -> Lap:
-    """The lap of `road`, sampled every metre; a long lap at 6000 places."""
+    """The lap of `road`, sampled every metre; a long lap has 6000 samples."""
     track = road.track
     count = min(round(track.length_m), MOST_SAMPLES)
     s = np.linspace(0.0, track.length_m, count + 1)

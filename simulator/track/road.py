@@ -77,12 +77,12 @@ class Road:
 
     @property
     def markings_y(self) -> NDArray[np.float64]:
-        """Lateral places (lanes + 1,) of the markings, from the leftmost to the rightmost."""
+        """Lateral positions (lanes + 1,) of the markings, from the leftmost to the rightmost."""
         return tf.marking_offsets(self.lanes, self.lane_width)
 
     def lines_y(self, to_middle: float) -> NDArray[np.float64]:
-        """Lateral places (lanes + 1,) of the lines that count for a car at `to_middle`: of a double
-        line, the line nearer to the car's lane."""
+        """Lateral positions (lanes + 1,) of the lines that count for a car at `to_middle`: for a
+        double line, the position of the line nearer to the car's lane."""
         if not self.line_offsets:
             return self.markings_y
         lane = tf.lane_index(to_middle, self.lanes, self.lane_width)

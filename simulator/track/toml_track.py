@@ -49,7 +49,7 @@ LOOKS: Final = (
 
 @dataclass(frozen=True)
 class Table:
-    """A TOML table with its place in the file, which error messages name."""
+    """A TOML table with its position in the file, which error messages name."""
 
     values: Mapping[str, Any]
     where: str

@@ -1,7 +1,8 @@
 """Lanes, shoulders, camera height and lines of one round. Metres; the leftmost line comes first.
 
 Neighbouring markings are one lane width apart, equal for all lanes. The two lines of a double line
-between lanes lie on both sides of the marking's place; at an edge, the inner line lies there.
+between lanes lie on both sides of the marking's nominal position; at an edge, the inner line lies
+at that position.
 """
 
 import math
@@ -22,7 +23,8 @@ CAMERA_HEIGHT_M = (0.9, 2.2)
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of paint, or a row of dots; its middle is `offset_m` left of its marking's place."""
+    """One line of paint, or a row of dots; its middle is `offset_m` left of the nominal position of
+    its marking."""
 
     offset_m: float
     width_m: float

@@ -11,7 +11,8 @@ from trackfeatures.errors import UserError
 def make_road(
     track: Track, lanes: int, lane_width_m: float | None, roads: str = ROADS[0], seed: int = 0
 ) -> Road:
-    """A road of one of `ROADS`. A varied road, its lane width included, is drawn from `seed`.
+    """A road of one of `ROADS`. A varied road, its lane width included, is random with the seed
+    `seed`.
 
     Raises UserError for an unknown kind, or a lane width for a varied road.
     """
@@ -21,7 +22,7 @@ def make_road(
         return Road(track, lanes, tf.LANE_WIDTH_M if lane_width_m is None else lane_width_m)
     if lane_width_m is not None:
         raise UserError(
-            f"a lane width of {lane_width_m:g} m asked for on varied roads, whose width is drawn; "
+            f"a lane width of {lane_width_m:g} m asked for on varied roads, whose width is random; "
             "leave it out, or choose the paper's roads"
         )
     tf.check_lanes(lanes, tf.LANE_WIDTH_M)

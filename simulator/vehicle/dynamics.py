@@ -219,8 +219,8 @@ def compute_forces_at(
     command: FloatArray,
     work: Work,
 ) -> None:
-    """`compute_forces` of a car whose place `at` (see `locate`) and axes in `work` are at hand; the
-    wrench is left in `work`."""
+    """`compute_forces` of a car whose position `at` (see `locate`) and axes in `work` are already
+    computed; the wrench is written to `work`."""
     axes, wheels, slip_gain, velocity, turned, wrench = work
     spin = memory[SPIN : SPIN + 4]
     piece, s, d = at

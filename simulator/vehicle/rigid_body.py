@@ -61,7 +61,7 @@ def integrate(p: Any, motion: FloatArray, wrench: FloatArray) -> None:
 
 @inlined
 def integrate_with(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
-    """`integrate`, with the body's `axes` (3, 3) at hand."""
+    """`integrate` of a body whose `axes` (3, 3) are already computed."""
     tx, ty, tz = gyroscopic_change(p, axes, motion)
     accelerate(p, axes, wrench, DT, motion[7:13])
     for i in range(3):

@@ -62,8 +62,8 @@ def touches_at(
     margin: float,
     radius: float,
 ) -> bool:
-    """`touches` of a car whose place `at` (see `locate`) is at hand; radius: radius of the car's
-    box plus the margin."""
+    """`touches` of a car whose position `at` (see `locate`) is already computed; radius: radius of
+    the car's box plus the margin."""
     _, s, d = at
     beside_wall = abs(d) > walls[0] - radius
     if not beside_wall and others.shape[0] == 0:

@@ -81,7 +81,7 @@ class PhysicsClient:
         pybullet.resetBasePositionAndOrientation(body, place, turn, physicsClientId=self._client)
 
     def park(self, body: int) -> None:
-        """Move a body out of reach of all others, each to its own place."""
+        """Move a body out of reach of all other bodies; each body has its own position there."""
         place, still = [20.0 * body, 0.0, -PARKING_DEPTH_M], [0.0, 0.0, 0.0]
         client = self._client
         pybullet.resetBasePositionAndOrientation(body, place, [0, 0, 0, 1], physicsClientId=client)

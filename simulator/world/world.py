@@ -341,7 +341,7 @@ def _fill_controls(command: Command, controls: FloatArray) -> None:
     if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
         raise UserError(
             f"the command has steer = {steer:.9g}, throttle = {throttle:.9g}, "
-            f"brake = {brake:.9g}; steer goes from -1 to 1, the others go from 0 to 1"
+            f"brake = {brake:.9g}; steer goes from -1 to 1, throttle and brake go from 0 to 1"
         )
     if not LOWEST_GEAR <= gear <= HIGHEST_GEAR or gear != int(gear):
         raise UserError(f"the command has gear = {gear}; gears are -1, 0 and 1 to 6")

@@ -42,15 +42,16 @@ class Bridge:
     half_across: float
 
     def inside(self, points: FloatArray) -> FloatArray:
-        """World points (..., 3) in the bridge's own frame."""
+        """World points (..., 3) converted to the bridge's own frame."""
         return self.turned(points - self.place)
 
     def turned(self, direction: FloatArray) -> FloatArray:
-        """World directions (..., 3) in the bridge's own frame."""
+        """World directions (..., 3) converted to the bridge's own frame."""
         return np.asarray(direction @ _turn(self.heading))
 
     def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
-        """Mask of the places that lie within `margin_m` of its footprint."""
+        """Mask of the points x, y (m, world) that lie within `margin_m` of the bridge's
+        footprint."""
         own = self.inside(np.stack([x, y, np.zeros_like(x)], axis=-1))
         along, across = np.abs(own[..., 0]), np.abs(own[..., 1])
         return (along < self.half_along + margin_m) & (across < self.half_across + margin_m)
@@ -68,7 +69,7 @@ def free_of(
     y: FloatArray,
     margin_m: float | FloatArray = KEEP_FREE_M,
 ) -> NDArray[np.bool_]:
-    """Mask of the places that are farther than `margin_m` from every bridge."""
+    """Mask of the points x, y (m, world) that are farther than `margin_m` from every bridge."""
     free = np.ones(np.shape(x), dtype=np.bool_)
     for bridge in bridges:
         free &= ~bridge.near(x, y, margin_m)
@@ -109,7 +110,7 @@ def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
 
 
 def _built(ground: Ground, s: float, style: str, rng: np.random.Generator) -> Bridge | None:
-    """A bridge of `style` over `s`, or None where there is no room for it."""
+    """A bridge of `style` over the road at `s` (m), or None where there is no room for it."""
     road = ground.road
     reach = bridge_styles.half_span(style, road.wall_offset)
     across = np.linspace(road.wall_offset + 1.0, reach + 4.0, 8)

@@ -26,7 +26,7 @@ ROAD_SIGNS: tuple[Point, ...] = ((0.02, 0.10, 0.34), (0.02, 0.17, 0.08))
 NO_COLOUR: Point = (0.0, 0.0, 0.0)
 SPAN_BEYOND_M = {"overpass": 13.0, "railway": 5.0, "footbridge": 3.0, "wooden": 3.0,
                  "adverts": 3.0, "arch": 5.0, "gantry": 1.4}  # fmt: skip
-"""How far a bridge of each style reaches beyond the wall line."""
+"""Distance by which a bridge of each style extends beyond the wall line."""
 
 
 class BridgeBuilder:
@@ -42,7 +42,8 @@ class BridgeBuilder:
         self._boxes: list[FloatArray] = []
 
     def box(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
-        """A closed box of `size` that stands on `at`, the middle of its floor, and its shadow."""
+        """Add a closed box of `size` that stands on `at`, the middle of its floor, and its
+        shadow."""
         self.box_without_shadow(size, at, colour, material)
         self.shadow_box(size, at)
 
@@ -58,7 +59,8 @@ class BridgeBuilder:
         self._boxes.append(np.array([at - half, at + half + np.array([0.0, 0.0, size[2]])]))
 
     def face(self, corners: list[FloatArray], colour: Point, material: float) -> None:
-        """A face of four corners, counter-clockwise from outside; textured by its own size."""
+        """Add a face with four corners, counter-clockwise seen from outside. Its texture
+        coordinates are metres from the first corner."""
         right = corners[1] - corners[0]
         along = right / max(float(np.linalg.norm(right)), 1e-9)
         uv = []
@@ -69,8 +71,8 @@ class BridgeBuilder:
         self._parts.append(face(corners, uv, colour, material))
 
     def board(self, size: tuple[float, float], at: Point, colour: Point, facing: float) -> None:
-        """A lettered board (width, height) across the road, its lower edge at `at`. `facing` is 1
-        for traffic along +x, -1 for traffic along -x."""
+        """Add a lettered board (width, height) across the road with its lower edge at `at`.
+        `facing` is 1 for traffic along +x, -1 for traffic along -x."""
         wide, high = size
         left, up = np.array([0.0, facing * wide / 2, 0.0]), np.array([0.0, 0.0, high])
         front = np.array(at) - np.array([0.045 * facing, 0.0, 0.0])

@@ -169,10 +169,10 @@ class Camera:
         "front" (any of VIEWS) is the colour picture (height, width, 3) uint8; "front:depth" the
         distance along the optical axis (height, width) float32 in metres, inf in the sky;
         "front:class" the index into CLASSES (height, width) uint8. Depth and class belong to the
-        surface at the pixel's centre; leaves and hedges count where they are more than half
-        opaque. All kinds of one view share one culling pass. `near_s`: distance (m) along the road
-        near which the car is, which tells a bridge from the road below; None: that of the last
-        picture. Raises UserError for an unknown view or kind.
+        surface at the pixel's centre; leaves and hedges count where they are more than half opaque.
+        All kinds of one view share one culling pass. `near_s`: approximate position (m) of the car
+        along the road, which distinguishes a bridge from the road below it; None: the position of
+        the last picture. Raises UserError for an unknown view or kind.
         """
         if near_s is not None:
             self._last_s = near_s
@@ -246,9 +246,10 @@ class Camera:
     def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
         """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
 
-        Fixed for views mounted on the car; `chase` and `top` stay level, so theirs depend on the
-        roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @ point)[:3] is (u, v, 1) times
-        the depth, before a lens's distortion. Raises UserError for an unknown view.
+        The matrix is constant for views mounted on the car. `chase` and `top` stay level, so their
+        matrices depend on the roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @
+        point)[:3] is (u, v, 1) times the depth, before a lens's distortion. Raises UserError for an
+        unknown view.
         """
         return optics.extrinsics(self.parameters, body_pose, view)
 

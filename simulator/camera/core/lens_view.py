@@ -18,7 +18,7 @@ MAX_ANGLE_DEG = 72.0
 """Largest angle from the optical axis that one pinhole view covers; the picture is black beyond."""
 SHARPNESS = 1.5
 """Pixels of the drawn view per picture pixel, along a line, where the lens enlarges most."""
-SAMPLES = 2  # looked up along each side of a pixel and averaged: a lens shrinks some places
+SAMPLES = 2  # looked up along each side of a pixel and averaged: a lens shrinks parts of the view
 MARGIN_PX = 2.0
 _OUTSIDE = -1e4  # px; outside every view
 

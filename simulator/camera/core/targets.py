@@ -22,7 +22,8 @@ _SKY = float(CLASSES.index("sky"))
 
 @dataclass(frozen=True)
 class Target:
-    """Where a picture is drawn (multisampled) and where it is resolved for reading."""
+    """The framebuffer that a picture is drawn to (multisampled), and the framebuffer that it is
+    resolved to for reading."""
 
     drawn: "moderngl.Framebuffer"
     resolved: "moderngl.Framebuffer"
@@ -46,7 +47,7 @@ class Target:
         return np.asarray(cv2.cvtColor(read, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
     def labels(self) -> NDArray[np.float32]:
-        """What was drawn (height, width, 2): depth in metres and number of the class."""
+        """The drawn labels (height, width, 2): depth in metres and number of the class."""
         width, height = self.resolved.size
         read = np.empty((height, width, 2), np.float32)
         self.resolved.read_into(read, components=2, dtype="f4")

@@ -13,7 +13,7 @@ from typing import Final
 from trackfeatures.errors import UserError
 
 Current = tuple[int | None, int | None, int | None, int | None]
-"""What is current in a thread: display, draw surface, read surface, context."""
+"""The display, draw surface, read surface and context that are current in a thread."""
 NOTHING: Final[Current] = (None, None, None, None)
 
 END_S: Final = 5.0
@@ -61,11 +61,11 @@ class Egl:
         return self._display(), self._surface(_DRAW), self._surface(_READ), context
 
     def give_back(self, own: Current, before: Current) -> None:
-        """Make `before` current again in place of `own`; nothing, if nothing was current before."""
+        """Make `before` current again in place of `own`; no context, if none was current before."""
         self.make_current(before if before is not NOTHING else (own[0], None, None, None))
 
     def make_current(self, wanted: Current) -> None:
-        """Raises ContextError where EGL refuses."""
+        """Make the context `wanted` current in this thread. Raises ContextError if EGL refuses."""
         if not self._make_current(*wanted):
             raise ContextError(
                 "the OpenGL context cannot be made current in this thread (EGL error "

@@ -61,7 +61,8 @@ def vignette(loss: float, width: int, height: int) -> FloatArray:
 
 
 def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
-    """Number of rows (W,), from the bottom, that the bonnet covers; the largest is its share."""
+    """Number of picture rows (W,) that the bonnet covers in each column, counted from the bottom.
+    The largest number is the share `cabin.bonnet` of the height."""
     rng = np.random.default_rng([cabin.shape, 2])
     x = (np.arange(width) + 0.5) / width * 2.0 - 1.0 - rng.normal(0.0, 0.15)
     drop = rng.uniform(0.05, 0.9) * np.abs(x) ** rng.uniform(1.6, 4.5)

@@ -1,5 +1,6 @@
 """Rain drops on the windscreen and the wiper that clears them, in pixels. There is no clock: the
-place along the road sets the wiper's position and how many drops have fallen since its stroke."""
+position along the road determines the position of the wiper and the number of drops that have
+fallen since its last stroke."""
 
 import math
 from dataclasses import dataclass

@@ -52,7 +52,8 @@ class TreeShade:
         return cls(terrain, MOST_SHADE * (1.0 - np.exp(-shade / MOST_SHADE)))
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """The shade at places, from the nearest grid point."""
+        """Share of sunlight that trees block at the points x, y (m, world), 0 to MOST_SHADE: the
+        value of the nearest grid point."""
         i, j, _ = self.terrain.grid.nearest(x, y)
         rows, columns = self.shade.shape
         return np.asarray(self.shade[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)])

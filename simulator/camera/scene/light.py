@@ -56,7 +56,8 @@ class Light:
 
     @staticmethod
     def named(kind: str, rng: np.random.Generator) -> "Light":
-        """A light of `kind`, its random parameters drawn from `rng`. UserError if unknown."""
+        """A light of `kind` with random parameters from `rng`. Raises UserError for an unknown
+        kind."""
         check_light(kind)
         drawn = draw(_tables(), kind, rng)
         elevation = drawn["sun_elevation"] = math.radians(drawn["sun_elevation_deg"])

@@ -31,7 +31,7 @@ from simulator.camera.scene.themes import Theme
 from simulator.camera.vegetation.scenery import DRY_M
 
 LAYOUT = ("3f 3f 3f 2f", "at", "facing", "colour", "face")
-"""Layout of a vertex: that of `solids` without the material."""
+"""Layout of a vertex: the layout of `solids` without the material."""
 CHUNK_M, REACH_M = 50.0, 350.0
 SMALL_M2, SMALL_REACH_M = 14.0, 130.0
 """Props of less area (posts, lamps, signs) are drawn only up to this distance: farther away they
@@ -294,6 +294,6 @@ def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -
 
 
 def _area(triangles: FloatArray) -> float:
-    """Area (m2) of triangles (3 T, ...) that begin with places."""
+    """Area (m2) of triangles (3 T, ...); the first three values of each vertex are its position."""
     a, b, c = (triangles[k::3, :3] for k in range(3))
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)

@@ -193,7 +193,8 @@ class Ground:
     def place_beside(
         self, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
     ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-        """Mask of the places (s, offset) that lie `clear_m` outside all wall lines; x, y of all."""
+        """Mask of the points (s, offset) that lie `clear_m` outside all wall lines, and x and y (m,
+        world) of all points."""
         pose = self.road.track.at(s, offset)
         near = self.line.distance(pose.x, pose.y)
         free = near > self.road.wall_offset + clear_m
@@ -205,7 +206,8 @@ class Ground:
         return bool((near > self.road.wall_offset + clear_m).all())
 
     def height(self, s: FloatArray, offset: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Visible height at places: the terrain, or the road mesh's skirt where it is higher."""
+        """Visible height (m) at points: the height of the terrain, or of the road mesh's skirt
+        where that is higher."""
         mesh = self.mesh
         row = np.clip(np.searchsorted(mesh.s, s), 0, len(mesh.s) - 1)
         skirt = mesh.ground(row, offset)

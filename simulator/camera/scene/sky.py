@@ -50,7 +50,7 @@ def _panorama_size(focal_px: float) -> tuple[int, int]:
 
 
 def _dome() -> NDArray[np.float32]:
-    """Triangles round the eye (n, 5): direction, place in the panorama (0 to 1)."""
+    """Triangles round the eye (n, 5): direction, position in the panorama (0 to 1)."""
     azimuth = np.linspace(-np.pi, np.pi, SECTORS + 1)
     elevation, height = np.radians([row[0] for row in _ROWS]), [row[1] for row in _ROWS]
     grid = np.empty((len(_ROWS), SECTORS + 1, 5), dtype=np.float32)

@@ -44,7 +44,8 @@ def strip(
     cells: Sequence[Sequence[tuple[int, int]]],
     levels: Sequence[Level] = LEVELS,
 ) -> Surface:
-    """Triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3) and places `s`.
+    """Triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3); the rows are at
+    `s` (m) along the road.
 
     `profile` (R, K) holds the values, in metres, that the kept rows must interpolate; level k joins
     the pairs of columns `cells[k]`. Rows that bound a chunk stay, so that neighbouring chunks of

@@ -82,7 +82,8 @@ class Grid:
     def nearest(
         self, x: FloatArray, y: FloatArray
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-        """Column and row nearest to places, and whether the grid has them."""
+        """Column and row of the grid point nearest to each point x, y (m, world), and whether the
+        point is within the grid."""
         i = np.rint((x - self.x0) / self.cell).astype(np.intp)
         j = np.rint((y - self.y0) / self.cell).astype(np.intp)
         return i, j, (i >= 0) & (j >= 0) & (i < self.shape[1]) & (j < self.shape[0])
@@ -127,7 +128,7 @@ class Terrain:
     """Height of the sea level; -inf without a sea."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height in m at world places x, y in m (arrays of one shape), interpolated on the
+        """Height in m at the world points x, y in m (arrays of one shape), interpolated on the
         triangles that are drawn."""
         grid = self.grid
         return between(self.z, (x - grid.x0) / grid.cell, (y - grid.y0) / grid.cell)

@@ -32,8 +32,8 @@ TUNNEL_STEP_M, TUNNEL_OVERHANG_M = 9.0, 4.5
 
 @dataclass(frozen=True)
 class Trees:
-    """N trees: feet (N, 3), width and height (N,), cell of the atlas, colour tint (N, 3) and
-    their place (s, offset) beside the road."""
+    """N trees: feet (N, 3), width and height (N,), cell of the atlas, colour tint (N, 3) and their
+    position (s, offset) beside the road."""
 
     feet: FloatArray
     width: FloatArray

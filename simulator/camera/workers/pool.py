@@ -1,4 +1,5 @@
-"""Worker processes that draw the pictures of many cars, each worker those of its own cars.
+"""Worker processes that draw the pictures of many cars; each worker draws the pictures of its own
+cars.
 
 The workers are new interpreters, neither forked nor imported from the user's script: OpenGL does
 not survive a fork, and a script needs no `if __name__ == "__main__"`.
@@ -39,7 +40,8 @@ class PictureWorkerError(UserError):
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the connection to it, its cars, and what it has been sent or owes."""
+    """A worker process and the connection to it; its cars, the sceneries that it was sent, and the
+    cars whose pictures it has yet to draw (`due`)."""
 
     number: int
     process: "subprocess.Popen[bytes]"
@@ -55,8 +57,8 @@ class PicturePool:
     """Draws pictures of `cars` cars in `workers` processes.
 
     `formats`: the picture of one car, by the name of its view. The processes start with the first
-    picture. After an error, Ctrl-C or `close` they are dead and their shared memory is free; the
-    next picture starts others.
+    picture. An error, Ctrl-C or `close` ends the processes and frees their shared memory; the next
+    picture starts new processes.
     """
 
     def __init__(
@@ -82,7 +84,8 @@ class PicturePool:
 
     @property
     def running(self) -> bool:
-        """Whether there are workers, of this process and not of one that it was forked from."""
+        """Whether this process has started workers. Workers of the process that it was forked from
+        do not count."""
         return bool(self._workers) and self._owner == os.getpid()
 
     def number_of(self, scenery: Scenery) -> int:
@@ -207,14 +210,14 @@ class PicturePool:
 
 
 def _nothing() -> None:
-    """What ends no workers."""
+    """Do nothing: the finaliser of a pool that has no workers."""
 
 
-NEXT = "all picture workers have been ended, and reset() starts others"
+NEXT = "all picture workers have been ended, and reset() starts new ones"
 
 
 def _how(process: "subprocess.Popen[bytes]") -> str:
-    """How a process, whose connection is closed, has ended."""
+    """A text about how a process ended that has closed its connection."""
     try:
         code = process.wait(END_S)
     except subprocess.TimeoutExpired:

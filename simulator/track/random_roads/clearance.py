@@ -42,7 +42,7 @@ def keeps_clear(segments: list[Segment]) -> bool:
 
 
 def _ahead(values: FloatArray, first: int, last: int) -> FloatArray:
-    """The values (N, last - first) that lie `first` to `last` places after each of `values` (N,),
-    round the lap."""
+    """The values (N, last - first) that lie `first` to `last` positions after each of `values`
+    (N,), round the lap."""
     lap = np.concatenate((values, values))
     return np.lib.stride_tricks.sliding_window_view(lap, last)[: len(values), first:]

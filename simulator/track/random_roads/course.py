@@ -26,7 +26,7 @@ RANK_NOISE: Final = 0.6
 
 
 class DoesNotFit(Exception):
-    """This polygon leaves no room for a bend; another one is drawn."""
+    """This polygon leaves no room for a bend; another random polygon is tried."""
 
 
 @dataclass(frozen=True)

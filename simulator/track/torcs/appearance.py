@@ -1,7 +1,7 @@
 """Chooses the look of an imported TORCS track from its category, surface, name and height.
 
-TORCS keeps scenery in 3D models, which are not read. For a name without a known word, one of the
-looks that suit a track with, or without, kerbs is drawn.
+TORCS keeps scenery in 3D models, which are not read. A name without a known word gets a random look
+of those that suit a track with, or without, kerbs.
 """
 
 import hashlib
