@@ -1,6 +1,6 @@
 """The scripted driver: follows the course of its round, keeps its distance, and overtakes.
 
-Steering by `simulator.driving.lateral_law` along the course. Track frame, left positive.
+`simulator.driving.lateral_law` computes the steering along the course. Track frame, left positive.
 """
 
 from math import atan
@@ -121,7 +121,8 @@ class ScriptedDriver:
         return self._law.steer(state, target, curvature, atan(slope))
 
     def _limit_lateral_speed(self, wanted: float, to_middle: float) -> float:
-        """`wanted` (m), approached from the last target at `MAX_LATERAL_SPEED` at most."""
+        """The next target offset (m): from the last target towards `wanted`, at most at
+        `MAX_LATERAL_SPEED`."""
         before = to_middle if self._steered_for is None else self._steered_for
         most = MAX_LATERAL_SPEED * self._dt
         self._steered_for = min(max(wanted, before - most), before + most)
@@ -158,8 +159,8 @@ class ScriptedDriver:
         return speed
 
     def _avoid_cars(self, wanted: float, state: CarState, traffic: Traffic) -> tuple[float, bool]:
-        """`wanted` (m), limited to the road and to places clear of cars alongside; whether it is
-        unchanged."""
+        """The offset `wanted` (m), limited to the part of the road that is clear of cars alongside;
+        and whether the limits left it unchanged."""
         low, high = -self._max_offset, self._max_offset
         length = self._road.track.length_m
         near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)

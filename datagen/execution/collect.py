@@ -107,7 +107,8 @@ def collect(
 def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
     """Write manifest, split, statistics, card of the finished rounds; returns the dataset's hash.
 
-    With shards, only the last shard to end does this, since all rounds exist then; others: None.
+    With shards, only the last shard to end does this, since all rounds exist then; the function
+    returns None in the other shards.
     """
     with setup_lock(folder):
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}

@@ -64,7 +64,7 @@ class TrackForecast:
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
-        """Read the chosen tracks; random roads are drawn when a round on them is forecast."""
+        """Read the chosen tracks; a random road is made when a round on it is forecast."""
         named = (c.name for c in choices if c.name != RANDOM)
         return TrackForecast({name: find_track(name, tracks_dir) for name in named})
 

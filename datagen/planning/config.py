@@ -94,7 +94,7 @@ class CollectConfig:
         str,
         Option(
             help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, "
-            "paint, surface, light and camera height are drawn for each round or scene."
+            "paint, surface, light and camera height are random for each round or scene."
         ),
     ] = "paper"
     prefix: Annotated[

@@ -134,7 +134,7 @@ def _roads(
 
 
 def _mounted(camera: CameraParameters, road: VariedRound | None) -> CameraParameters:
-    """The camera at the height drawn for a varied road; unchanged on the paper's roads."""
+    """The camera at the random height of a varied road; unchanged on the paper's roads."""
     if road is None:
         return camera
     height = road.carriageway.camera_height_m

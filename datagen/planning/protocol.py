@@ -58,7 +58,8 @@ def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
 
 
 def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) -> RoundPlan:
-    """A drive of `frames` frames from the start line; its other values are those of `like`."""
+    """A drive of `frames` frames from the start line; all its other values are taken from the round
+    `like`."""
     return replace(
         like,
         id=f"drive-{track.name}-{light}",

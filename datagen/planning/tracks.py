@@ -18,9 +18,9 @@ def choose_tracks(
     """The named tracks. Without names: the project's and all TORCS tracks found, not `HELD_OUT`.
 
     With `unseen`: the tracks of `HELD_OUT` that are found, or named tracks outside training plans.
-    `random` is kept as it is: each round will have a random road of its own, unseen by all others.
-    Raises UnknownTrack for a name that is not found, TrackError for a bad file, UserError for a
-    training track given as unseen.
+    `random` is kept as it is: each round will have a random road of its own, which no other round
+    has. Raises UnknownTrack for a name that is not found, TrackError for a bad file, UserError for
+    a training track given as unseen.
     """
     files = track_files(tracks_dir)
     held_out = tuple(name for name in HELD_OUT if name in files)

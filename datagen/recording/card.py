@@ -1,6 +1,6 @@
 """Fills the dataset card `card.md`, which becomes `README.md` of a dataset folder.
 
-Its YAML header is that of the Hugging Face hub: huggingface.co/docs/hub/datasets-cards.
+Its YAML header is in the format of the Hugging Face hub: huggingface.co/docs/hub/datasets-cards.
 """
 
 from collections.abc import Iterator

@@ -98,7 +98,8 @@ class Frames:
         return Frames(self.rounds, self._indexes, self.camera, kept)
 
     def places(self) -> NDArray[np.int64]:
-        """Place of each frame (N, 2): index of its round in `rounds`, its number in that round."""
+        """Position of each frame (N, 2): index of its round in `rounds`, number of the frame in
+        that round."""
         number = np.searchsorted(self._first, self._rows, "right") - 1
         return np.column_stack([number, self._rows - np.array(self._first)[number]])
 

@@ -117,7 +117,7 @@ def state_path(folder: Path, round_id: str) -> Path:
 def _partial_home(folder: Path, round_id: str) -> Path:
     """The folder of an unfinished round. Raises BadName, or DatasetError for a link.
 
-    Its content is deleted, so it must not lead out of the dataset.
+    Its content is deleted, so it must lie within the dataset.
     """
     home = folder / PARTIAL / require_name(round_id, "round id")
     if home.parent.is_symlink():

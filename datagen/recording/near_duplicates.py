@@ -19,7 +19,8 @@ MAX_LISTED = 10
 
 @dataclass(frozen=True, slots=True)
 class Tolerances:
-    """Largest difference of two near-duplicates: along the road, across it, and in yaw."""
+    """Largest differences between two near-duplicates: along the road (m), across it (m), and in
+    the angle to the road (degrees)."""
 
     s_m: float = 0.5
     to_middle_m: float = 0.1
@@ -30,7 +31,8 @@ class Tolerances:
 class NearPair:
     """A frame and the nearest frame of the other side.
 
-    `distance` is the largest difference in units of its tolerance: 0 same pose, 1 the limit.
+    `distance` is the largest difference in units of its tolerance: 0 means the same pose, 1 the
+    limit.
     """
 
     distance: float

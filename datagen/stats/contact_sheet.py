@@ -40,7 +40,7 @@ def contact_sheet(dataset: Dataset, most: int = 24) -> Iterator[Card]:
     chosen = _diverse_order(dataset.rounds)[:most]
     for place, number in enumerate(chosen):
         info = dataset.rounds[number]
-        # Multiples of the golden ratio: evenly spread over the places in a round.
+        # Multiples of the golden ratio: evenly spread over the length of a round.
         frame = int((place * 0.6180339887498949 % 1.0) * info.frames)
         yield _card(info, frame, (dataset.camera.height, dataset.camera.width))
 

@@ -126,7 +126,7 @@ def _rare_labels(statistics: dict[str, Any]) -> Iterator[str]:
 
 
 def _one_sided_properties(rounds: list[RoundInfo]) -> Iterator[str]:
-    """Values of a property that occur in one split and not in the other."""
+    """Values of a property that occur in one split and not in the other split."""
     by_split = {s: [info for info in rounds if info.split == s] for s in REQUIRED_SPLITS}
     if not all(by_split.values()):
         return

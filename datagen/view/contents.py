@@ -110,7 +110,8 @@ class Contents:
         raise DatasetError(f"{self.steps.index.path}: no transform of {child} in step {number}")
 
     def boxes(self, number: int, frame: str = WORLD) -> list[Box]:
-        """Boxes of the other cars in the world; with `frame` EGO, of the car itself."""
+        """Boxes of the other cars in the world frame; with `frame` EGO, the box of the car
+        itself."""
         entities = self.steps.message(TRAFFIC, number).entities
         return [
             Box(Pose(_vector(c.pose.position), _quaternion(c.pose.orientation)), _vector(c.size))

@@ -29,7 +29,7 @@ from datagen.recording.splits import (
 class Report:
     """The result of `datagen verify`; its fields are the keys of `--json`.
 
-    `content_hash` is that of the dataset, None if a round cannot be read.
+    `content_hash` is the hash of the dataset, None if a round cannot be read.
     """
 
     ok: bool

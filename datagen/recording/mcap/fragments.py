@@ -48,8 +48,8 @@ class FoundMessage:
 def find_chunks(data: bytes) -> Iterator[ChunkBytes]:
     """All undamaged chunks and, after the last of them, the start of a chunk that was cut off.
 
-    A chunk with a wrong CRC that is followed by others or by its index is left out: any byte of it
-    may be wrong.
+    A chunk with a wrong CRC that is followed by other chunks or by its index is left out: any byte
+    of it may be wrong.
     """
     view = memoryview(data)
     at, torn = 0, None

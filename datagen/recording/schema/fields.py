@@ -1,7 +1,7 @@
 """Unit, frame, reference point, limits and meaning of absence of every recorded field.
 
 The JSON schema of a dataset and the tables of its card are generated from this. Names and types of
-the fields are those of `proto/driverview.proto`.
+the fields are the same as in `proto/driverview.proto`.
 """
 
 import math
