@@ -9,8 +9,8 @@ Deviations: the outputs are our six coded values instead of their fourteen, and 
 sigmoid; no mean image is subtracted; training uses our recipes. It has no classifier: each class
 has probability one third.
 
-`grid`: five convolutions that keep a grid of 9 x 18 places; the paper's convolutions end in a
-single place. Its outputs are distributions over bins (`mtlnet.model.bins`). It does not read the
+`grid`: five convolutions that keep a grid of 9 x 18 positions; the paper's convolutions end in a
+single position. Its outputs are distributions over bins (`mtlnet.model.bins`). It does not read the
 image rows of the sky. In training, auxiliary heads read the positions of the lane's markings from
 the grid and the curvature ahead from the shared features (`mtlnet.model.auxiliary`).
 
@@ -94,8 +94,8 @@ class Architecture:
 
     @property
     def keeps_places(self) -> bool:
-        """Whether the last features form a grid of places in the image instead of a single
-        place."""
+        """Whether the last features form a grid of positions in the image instead of a single
+        position."""
         return bool(self.features) and grid_size(self)[1] > 1
 
     @property

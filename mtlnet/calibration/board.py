@@ -31,8 +31,8 @@ OUTLIER = 4.0
 Picture = NDArray[np.uint8]
 Corners = NDArray[np.float32]
 Finder = Callable[[Picture], tuple[Corners, Corners] | None]
-"""Finds the corners on the board (N, 3) and in a grey picture (N, 2); None where it shows no
-board."""
+"""Returns the corners on the board (N, 3) and in a grayscale picture (N, 2); None where the picture
+shows no board."""
 
 
 class NoBoard(UserError):
@@ -82,7 +82,9 @@ def calibrate_board(
     sizes = {grey.shape for _, grey, _ in pictures if grey is not None}
     if len(sizes) > 1:
         listed = ", ".join(sorted(f"{w} x {h}" for h, w in sizes))
-        raise NoBoard(f"the pictures are of different sizes ({listed}); give those of one camera")
+        raise NoBoard(
+            f"the pictures are of different sizes ({listed}); give pictures of one camera"
+        )
     board, found, size = _find(pictures, board)
     if len(found) < MIN_PICTURES:
         raise _no_board(board, len(found), pictures)

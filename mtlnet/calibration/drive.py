@@ -105,7 +105,7 @@ def _calibrate(
         if (picture.shape[1], picture.shape[0]) != size:
             raise UserError(
                 f"the pictures are of different sizes ({size[0]} x {size[1]}, then "
-                f"{picture.shape[1]} x {picture.shape[0]} px); give those of one camera"
+                f"{picture.shape[1]} x {picture.shape[0]} px); give pictures of one camera"
             )
         calibration.add(picture, time_s)
         if time_s >= (len(shown) + 0.5) * show_every_s and len(shown) < SHOWN:

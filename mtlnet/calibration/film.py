@@ -97,7 +97,7 @@ class DriveEstimate:
 class DriveCalibration:
     """Collects pictures of a drive and estimates the mount of their camera.
 
-    The place x, y of `lens` in the car is kept; height and angles are estimated. Without a given
+    The position x, y of `lens` on the car is kept; height and angles are estimated. Without a given
     lane width, `LANE_WIDTH_M` is assumed.
     """
 

@@ -41,16 +41,16 @@ def find_lens(
 ) -> KnownLens:
     """The lens of pictures of `size` (width, height).
 
-    The first known of: the lens `given`, the field of view `fov_y_deg`, the focal length of
-    `photo`; else a guess. Its place in the car is the place of the model's camera. Raises
-    UserError.
+    The lens is the first of these that is known: the lens `given`, the field of view `fov_y_deg`,
+    the focal length of `photo`; else it is a guess. Its position on the car is the position of the
+    model's camera. Raises UserError.
     """
     width, height = size
     if given is not None:
         if abs(given.width * height - given.height * width) > 0.01 * given.width * height:
             raise UserError(
-                f"the pictures are {width} x {height} px, those of the camera file "
-                f"{given.width} x {given.height}: give the file of this camera"
+                f"the pictures are {width} x {height} px, the camera file is for "
+                f"{given.width} x {given.height} px: give the file of this camera"
             )
         return KnownLens(given.resized(width, height), 0.0, "its lens is given")
     plain = CameraParameters(width, height, x=model.x, y=model.y)

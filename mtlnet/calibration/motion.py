@@ -20,7 +20,7 @@ MIN_SPREAD_PX = 8
 WINDOW = (21, 21)
 LEVELS = 4
 MAX_RETURN_PX = 0.5
-"""Maximum distance between a point and its place after it was followed forward and back."""
+"""Maximum distance between a point and its position after it was followed forward and back."""
 BONNET = 0.12
 """Share of rows at the bottom that are ignored (the car's bonnet)."""
 ROUNDS = 8
@@ -39,8 +39,8 @@ class Motion:
 
 
 def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | None:
-    """Points u, v in both of two grey pictures (N, 4); None where too few points can be followed or
-    nothing moves."""
+    """Points that are found in two grayscale images: (N, 4), u and v in px in `before`, then in
+    `after`. None where too few points can be followed or nothing moves."""
     seen = np.full(before.shape, 255, np.uint8)
     seen[round((1 - BONNET) * len(seen)) :] = 0
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)
@@ -91,7 +91,7 @@ def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion
         system = design.T @ (weight[:, None] * design) + held
         pull = held[3:, 3:] @ (heading[:2] - towards)
         right = -design.T @ (weight * error) - np.concatenate([np.zeros(3), pull])
-        if not np.linalg.cond(system) < MAX_CONDITION:  # for example if all points are in one place
+        if not np.linalg.cond(system) < MAX_CONDITION:  # e.g. all points close together
             return None
         change = np.linalg.solve(system, right)
         rotation += change[:3]

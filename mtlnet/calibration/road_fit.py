@@ -151,8 +151,8 @@ def _below(lines: Lines, y0: float) -> FloatArray:
 
 
 def _slope_std(lines: Lines, below: FloatArray) -> FloatArray:
-    """Standard deviation of a segment's slope against its marking's, including that of an uneven
-    road."""
+    """Standard deviation of the difference between the slopes of a segment and of its marking, with
+    the part that an uneven road adds."""
     return np.asarray(np.hypot(lines.slope_std, 0.02 + 0.004 / below), np.float64)
 
 

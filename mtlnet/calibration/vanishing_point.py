@@ -1,7 +1,7 @@
 """The film's vanishing point to half a degree: where most segments of markings intersect.
 
-Intersections on bends, during lane changes and of objects not along the road are scattered; those
-of straight driving add up.
+Intersections on bends, during lane changes and of objects not along the road are scattered; the
+intersections of straight driving coincide.
 """
 
 from collections.abc import Iterable

@@ -86,8 +86,8 @@ class CustomImages:
         return np.take(self.images, indices, axis=0, out=out)
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, 9 to 22) with distances converted to metres at the pictures' own
-        cameras."""
+        """A model's outputs (N, K; columns: `split_outputs`) with distances converted to metres at
+        the pictures' own cameras."""
         found = outputs.copy()
         for lens in {lens for lens in self.lenses if lens is not None}:
             rows = [i for i, each in enumerate(self.lenses) if each == lens]

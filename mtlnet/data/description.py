@@ -18,8 +18,8 @@ def describe_data(
     """Description of a model's training data; `mean`, the mean of the labels, is the baseline.
 
     `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks count
-    as seen by the model; `frames` does not include their frames. The entries `split`, `held_out`
-    and `seeds` are those of `mtlnet.inference.trained_rounds`.
+    as seen by the model; `frames` does not include their frames. `mtlnet.inference.trained_rounds`
+    makes the entries `split`, `held_out` and `seeds`.
     """
     fitted = held_out.rounds if held_out is not None else []
     rounds = [*frames.rounds, *fitted]

@@ -1,4 +1,5 @@
-"""Labels and outputs for rounds whose camera is mounted at another place than the model's.
+"""Labels and outputs for rounds whose camera is mounted at another position than the model's
+camera.
 
 A picture does not show the height of its camera, so the network answers as if every picture were
 taken by the model's camera. It is therefore trained on the distances that a car with the model's
@@ -36,7 +37,8 @@ def model_labels(frames: Frames) -> Labels:
 
 
 def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.float32]:
-    """A model's outputs (N, 9 to 22) for `frames`, converted to metres of the recorded cars."""
+    """A model's outputs (N, K; columns: `split_outputs`) for `frames`, converted to metres of the
+    recorded cars."""
     changed, of_round = outputs.copy(), frames.labels.round
     for number, info in moved_rounds(frames):
         rows = np.flatnonzero(of_round == number)
@@ -45,7 +47,8 @@ def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.floa
 
 
 def moved_rounds(frames: Frames) -> list[tuple[int, RoundInfo]]:
-    """Number and description of each round whose camera is mounted at another place."""
+    """Number and description of each round whose camera is mounted at another position than the
+    model's camera."""
     rounds = enumerate(frames.rounds)
     return [(n, info) for n, info in rounds if not _as_mounted(info.label_camera, frames.camera)]
 

@@ -100,7 +100,7 @@ def copied_label(
         distances = np.where(np.isinf(swapped), np.float32(UNKNOWN_M), swapped)
         return distances, -angle, tf.mirror_heading(heading)
     if copy in TURNS_RAD:
-        # The camera keeps its place; the centre of gravity moves around it.
+        # The camera keeps its position; the centre of gravity moves around it.
         turned = angle + np.float32(TURNS_RAD[copy])
         ahead = np.sin(turned) - np.sin(angle)
         aside = np.cos(turned) - np.cos(angle)

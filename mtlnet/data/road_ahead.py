@@ -41,7 +41,7 @@ NEAREST_M, APART_M = 12.0, 1.2
 """Limits, m ahead and to the side, for the start of a polyline of this lane's markings."""
 CHUNK = 20_000  # frames per task of a reading process
 KNOWN_M = 2.0
-"""A curvature is known if a frame was recorded within this distance of the place."""
+"""A curvature is known if a frame was recorded within this distance of the point."""
 
 HARD_CURVATURE = 1 / 80
 HARD_NEAR_CHANGE_M = 8.0
@@ -239,10 +239,10 @@ def hard_frames(
     heading: NDArray[np.int64],
     tracks: NDArray[np.str_],
 ) -> NDArray[np.bool_]:
-    """Frames (N,) in sharp bends, or near a place where the class of the road changes.
+    """Frames (N,) in sharp bends, or near a point where the class of the road changes.
 
     Most errors of a network occur there. `s` m, `curvature` 1/m and `heading` (N,) are the labels;
-    all frames of a track together give the places where its class changes.
+    all frames of a track together give the points where its class changes.
     """
     found = np.abs(curvature) > HARD_CURVATURE
     for track in np.unique(tracks).tolist():

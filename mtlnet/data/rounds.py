@@ -68,7 +68,7 @@ def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
 
 
 def require_camera(card: ModelCard, camera: CameraParameters) -> None:
-    """Raise ModelError when `camera`, that of the data, differs from the model's."""
+    """Raise ModelError when `camera`, the camera of the data, differs from the model's camera."""
     found, expected = camera.as_dict(), card.camera.as_dict()
     if found != expected:
         differing = ", ".join(

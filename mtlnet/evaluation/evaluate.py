@@ -137,9 +137,10 @@ def predict_frames(
     frames: Images,
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """Outputs (N, 9 to 22) for all frames, one thread per engine.
+    """Outputs (N, K; columns: `split_outputs`) for all frames, one thread per engine.
 
-    One frame at a time, as in the service; on a GPU `CHUNK` frames at once.
+    An engine computes one frame at a time, as in the service; on a GPU it computes `CHUNK` frames
+    at once.
     """
     idle: SimpleQueue[tuple[Engine, NDArray[np.uint8]]] = SimpleQueue()
     for engine in engines:

@@ -49,7 +49,7 @@ def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any)
 
 
 def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
-    """HTML page of `report` on `outputs` (N, 9 to 22) for `frames`."""
+    """HTML page of `report` on `outputs` (N, K; columns: `split_outputs`) for `frames`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     return render(
         "mtlnet.evaluation",
@@ -176,7 +176,8 @@ def _intervals(x: NDArray[np.float64], chosen: NDArray[np.bool_]) -> list[tuple[
 
 WORST_PER_FEATURE = 2
 MIN_FRAMES_APART = 40
-"""Least number of frames between two worst frames of a round, so that a place is shown once."""
+"""Least number of frames between two worst frames of a round, so that each part of the road is
+shown once."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +238,7 @@ def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[
     note = ""
     if prediction.std is not None:
         std = prediction.std[worst.feature]
-        if std is None:  # absent: the error is that of the undecoded value
+        if std is None:  # absent: the error of the undecoded value
             note = ", predicted absent"
         else:
             note = f", predicted standard deviation {std:.2g} {unit}"

@@ -24,10 +24,10 @@ CALIBRATION_BINS = 10
 
 
 def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> NDArray[np.float64]:
-    """Errors (N, 7) of outputs (N, 9 or more).
+    """Errors (N, 7) of outputs (N, K; columns: `split_outputs`).
 
-    The error of a marking is that of the predicted value, even if it decodes to "inactive".
-    `to_lane_centre` has an error where both label and prediction have a value.
+    The error of a marking is the error of the predicted value, even if the value decodes to
+    "inactive". `to_lane_centre` has an error where both label and prediction have a value.
     """
     values = tf.decode_values(outputs[:, :6])
     offset = tf.localise(tf.decode(outputs[:, :6])[0]) - tf.localise(distances)
@@ -82,8 +82,8 @@ def calibration(
     """For each feature by name: predicted standard deviations and observed errors, in bins of equal
     count.
 
-    Each bin has the root mean square of the predicted standard deviations ("said"), that of the
-    errors ("found"), and the number of frames.
+    Each bin has the root mean square of the predicted standard deviations ("said"), the root mean
+    square of the errors ("found"), and the number of frames.
     """
     return {name: _bins(std[:, i], errors[:, i]) for i, name in enumerate(FEATURES)}
 
@@ -159,7 +159,8 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: LabelArrays, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on `outputs` (N, 9 to 22) for `labels`; `mean`: from `mean_labels`.
+    """The report on `outputs` (N, K; columns: `split_outputs`) for `labels`; `mean`: from
+    `mean_labels`.
 
     It has the key `uncertainty` when the model predicts standard deviations.
     """

@@ -52,7 +52,7 @@ class Case:
     copy: str
     row: int | None
     verdict: str
-    """What went wrong, in words; empty if nothing did."""
+    """A text about the failure; empty if there is none."""
 
 
 def write_picture_page(path: Path, report: dict[str, Any], answers: Answers) -> Path:
@@ -126,8 +126,8 @@ def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def cases(answers: Answers) -> list[Case]:
     """All pictures and copies, failures first.
 
-    The order: refused ones, absent answers, then by the largest error in units of its feature's
-    mean error.
+    The order: refused pictures, absent answers, then all others by their largest error in units of
+    its feature's mean error.
     """
     images = answers.images
     sizes = np.abs(answers.errors)

@@ -31,7 +31,7 @@ class Answers:
 
     images: CustomImages
     outputs: NDArray[np.float32]
-    """Outputs (N, 9 to 22) in metres at the pictures' own cameras."""
+    """Outputs (N, K; columns: `split_outputs`) in metres at the pictures' own cameras."""
     true: NDArray[np.float64]
     """Labels (N, 5), NaN where absent or unknown."""
     found: NDArray[np.float64]
@@ -73,7 +73,8 @@ class Answers:
 def judge(
     images: CustomImages, outputs: NDArray[np.float32], trained: Sequence[str] = ()
 ) -> Answers:
-    """The answers for `outputs` (N, 9 to 22), the model's outputs for the rectified images."""
+    """The answers for `outputs` (N, K; columns: `split_outputs`), the model's outputs for the
+    rectified images."""
     outputs = images.outputs(outputs)
     distances, angle = tf.decode(outputs[:, :6])
     labels = images.labels

@@ -125,7 +125,8 @@ def protocol_rows(
     """The rows of the table: drives, four intervals of heavy shadow, held-out rounds of nine
     tracks.
 
-    `outputs` (N, 9 to 22); `rows`: from `drive_rows`; `held_out`: the report on the other frames.
+    `outputs` (N, K; columns: `split_outputs`); `rows`: from `drive_rows`; `held_out`: the report on
+    the other frames.
     """
     shaded = rows[SHADED]
     window = max(1, INTERVAL_FRAMES // every)

@@ -48,10 +48,10 @@ class Engine(Protocol):
         """Precision of the computation: "f32", "bf16" or "int8"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Outputs (9,) to (22,) for an image (H, W, 3) RGB of the size of `card.camera`.
+        """Outputs (K,) for an image (H, W, 3) RGB of the size of `card.camera`.
 
-        `mtlnet.inference.prediction.decode_outputs` converts them to metres and radians. Raises
-        ModelError for an image of another size or type.
+        `mtlnet.inference.prediction.split_outputs` explains the K numbers, `decode_outputs`
+        converts them to metres and radians. Raises ModelError for an image of another size or type.
         """
 
 
@@ -153,7 +153,7 @@ def read_graph(run: Path, card: ModelCard) -> Any:
 def run_graph(
     graph: Any, precision: str, images: NDArray[np.uint8], batch: int = 1
 ) -> NDArray[np.float32]:
-    """Outputs (N, 9 to 22) of an OpenVINO model for images (N, 210, 280, 3).
+    """Outputs (N, K; columns: `split_outputs`) of an OpenVINO model for images (N, 210, 280, 3).
 
     `graph`: the model or the path of its file; `batch`: images per inference. Raises RuntimeError
     when OpenVINO cannot load it.
@@ -207,7 +207,7 @@ def int8_graph(run: Path, card: ModelCard) -> Path:
     if about is None:
         raise ModelError(f"{run} has no int8 graph; {how}")
     if about["model_hash"] != card.model_hash:
-        raise ModelError(f"{folder} was made from other weights than those of {run}; {how}")
+        raise ModelError(f"{folder} was made from other weights than the weights of {run}; {how}")
     for name in (GRAPH, GRAPH_WEIGHTS):
         path = folder / name
         if not path.is_file() or file_hash(path) != about["files"].get(name):

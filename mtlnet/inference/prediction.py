@@ -46,7 +46,9 @@ class OutputParts:
 
 
 def split_outputs(outputs: NDArray[np.float32]) -> OutputParts:
-    """Split outputs (..., 9 to 22): nine outputs, then uncertainty (8) and absence (5) if present.
+    """Split outputs (..., K) into their parts: nine outputs (five coded distances, coded angle,
+    three class probabilities), then 8 of the uncertainty head and 5 probabilities of absence, if
+    the model has them. So K is 9, 14, 17 or 22.
 
     `mtlnet.model.uncertainty_head` defines the uncertainty columns. Raises ValueError for another
     number of columns.
@@ -54,7 +56,7 @@ def split_outputs(outputs: NDArray[np.float32]) -> OutputParts:
     width = outputs.shape[-1] if outputs.ndim else 0
     if width not in _HAS:
         raise ValueError(
-            f"a model gives {', '.join(map(str, sorted(_HAS)))} numbers an image, "
+            f"a model gives {', '.join(map(str, sorted(_HAS)))} numbers for an image, "
             f"not shape {outputs.shape}"
         )
     with_uncertainty, with_absent = _HAS[width]
@@ -109,7 +111,8 @@ class Prediction:
 
 
 def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
-    """Decode the outputs (9,) to (22,) of one image. Raises ValueError as `split_outputs`."""
+    """Decode the outputs (K,) of one image. Raises ValueError as `split_outputs`, which explains
+    K."""
     if outputs.ndim != 1:
         raise ValueError(f"the outputs of one image have one axis, not shape {outputs.shape}")
     parts = split_outputs(outputs)

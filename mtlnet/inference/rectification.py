@@ -44,7 +44,8 @@ Metres = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rectification:
-    """Converts images of one camera to images of another, at the same or another place of the car.
+    """Converts images of one camera to images of another camera, at the same or another position on
+    the car.
 
     `source` took the images, at any size of its aspect ratio; `target`, without distortion, is the
     model's camera.
@@ -63,7 +64,7 @@ class Rectification:
 
     @property
     def view(self) -> CameraParameters:
-        """The camera that takes the rectified images from the place of the source."""
+        """The camera that takes the rectified images from the position of the source."""
         source = self.source
         return replace(self.target, x=source.x, y=source.y, z=source.z)
 
@@ -128,12 +129,13 @@ class Rectification:
                 )
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, 9 to 22) for rectified images, converted to the car of the source.
+        """A model's outputs (N, K; columns: `split_outputs`) for rectified images, converted to the
+        car of the source.
 
-        Distances change, and so do their standard deviations, which include that of the source's
-        height; absent ones stay absent. The angle does not change, because the rectified view looks
-        along the car. All images of a camera that is too high or too low (`SEEN_LANES_M`) are out
-        of distribution.
+        Distances change, and so do their standard deviations, which include the standard deviation
+        of the source's height; absent distances stay absent. The angle does not change, because the
+        rectified view looks along the car. All images of a camera that is too high or too low
+        (`SEEN_LANES_M`) are out of distribution.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)

@@ -46,7 +46,7 @@ class TorchEngine:
         return result
 
     def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Outputs (B, 9) to (B, 22) for images (B, H, W, 3)."""
+        """Outputs (B, K; columns: `split_outputs`) for images (B, H, W, 3)."""
         device = next(self.served.parameters()).device
         with torch.inference_mode():
             parts = [

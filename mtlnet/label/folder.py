@@ -84,7 +84,7 @@ class LabelFolder:
     def rows(self) -> dict[str, Cells]:
         """Rows of `labels.csv` by file; empty if there is no such file.
 
-        They are read again when the file has changed; do not change what is returned.
+        They are read again when the file has changed; do not change the returned dictionary.
         """
         path = self.folder / LABELS
         if not path.is_file():

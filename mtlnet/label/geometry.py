@@ -93,8 +93,8 @@ def _refine(
 ) -> tuple[float, NDArray[np.float64]]:
     """Sum of squares, px^2, and the values (5,) after those at the indices `free` were fitted.
 
-    By the method of Levenberg and Marquardt. The sum is infinite where a point is not on the road,
-    and stays so from such a start.
+    Uses the Levenberg-Marquardt method. The sum is infinite where a point is not on the road; a
+    search that starts with an infinite sum ends with one.
     """
     names = np.flatnonzero(free)
     residual = _residuals(camera, pixels, sides, values)

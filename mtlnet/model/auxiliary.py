@@ -2,10 +2,10 @@
 
 Columns: where the markings of the car's lane cross the image rows `ROWS`, computed from the grid by
 a 1 x 1 convolution. For each marking and row it is a softmax over the columns of the grid; the
-label is split between two neighbouring columns. Curvature: that of the road at `AHEAD_M` in front
-of the car, computed from the last shared features; for each distance it is a softmax over bins. The
-columns preserve small details of the image, the curvature shows where a bend begins. Labels:
-`mtlnet.data.road_ahead`; unknown labels do not count.
+label is split between two neighbouring columns. Curvature: the curvature of the road at `AHEAD_M`
+in front of the car, computed from the last shared features; for each distance it is a softmax over
+bins. The columns preserve small details of the image, the curvature shows where a bend begins.
+Labels: `mtlnet.data.road_ahead`; unknown labels do not count.
 """
 
 import torch

@@ -1,4 +1,5 @@
-"""The multi-task network of the paper (section IV-C) and the others of `mtlnet.architecture`.
+"""The multi-task network of the paper (section IV-C) and the other networks of
+`mtlnet.architecture`.
 
 Input: uint8 RGB images (B, 210, 280, 3). Output (B, 9): five coded distances and the coded angle
 (linear), then scores of the classes left, straight, right (before the softmax). Recipe `fast`

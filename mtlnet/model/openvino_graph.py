@@ -34,16 +34,17 @@ MIN_NARROW_VALUES = 256  # smaller constants stay in float32
 
 
 def build_graph(network: Network, head: UncertaintyHead | None = None, batch: int = 1) -> Any:
-    """OpenVINO model of a folded network: uint8 images (B, 210, 280, 3) -> float32 (B, 9 to 22).
+    """OpenVINO model of a folded network: uint8 images (B, 210, 280, 3) -> float32 (B, K).
 
-    The columns are those of `mtlnet.inference.prediction.split_outputs`. `batch`: number of images;
+    `mtlnet.inference.prediction.split_outputs` explains the K columns. `batch`: number of images;
     -1: any number, which is slower for a single image.
     """
     return _converted(ServedNetwork(network, head), batch)
 
 
 def build_feature_graph(network: Network) -> Any:
-    """OpenVINO model with the three results of `FitInputs`, for one image."""
+    """OpenVINO model of `mtlnet.model.served.FitInputs` for one image: its three results are the
+    nine outputs, the inputs of the uncertainty head and the textures."""
     return _converted(FitInputs(network), 1)
 
 
@@ -57,8 +58,8 @@ def write_graph(
 ) -> None:
     """Write the graph to `graph` (.xml) and its weights to `weights` (.bin).
 
-    `narrow`: constants that float16 holds exactly are stored in it, the others in float32. Raises
-    OSError when writing fails, for example on a full disk; both files are then unchanged.
+    `narrow`: constants that float16 holds exactly are stored in float16, all others in float32.
+    Raises OSError when writing fails, for example on a full disk; both files are then unchanged.
     """
     import openvino
 

@@ -15,8 +15,8 @@ from mtlnet.model.uncertainty_head import UncertaintyHead
 class ServedNetwork(nn.Module):
     """A folded network, its softmax, and its uncertainty head if it has one.
 
-    uint8 images (B, 210, 280, 3) -> float32 (B, 9 to 22); the columns are those of
-    `mtlnet.inference.prediction.split_outputs`.
+    uint8 images (B, 210, 280, 3) -> float32 (B, K); `mtlnet.inference.prediction.split_outputs`
+    explains the K columns.
     """
 
     def __init__(self, network: Network, head: UncertaintyHead | None = None) -> None:
@@ -39,8 +39,8 @@ class ServedNetwork(nn.Module):
 
 
 class FitInputs(ServedNetwork):
-    """What the uncertainty head is fitted on: the nine outputs, the inputs of the head (B, X) and
-    the textures (B, C + M)."""
+    """The data that the uncertainty head is fitted on: the nine outputs, the inputs of the head (B,
+    X) and the textures (B, C + M; `mtlnet.model.textures`)."""
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
         x = self.network.forward_features(images)

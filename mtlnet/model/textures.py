@@ -1,4 +1,5 @@
-"""Texture features of an image: what the out-of-distribution score and the light are computed from.
+"""Texture features of an image, from which the out-of-distribution score and the light are
+computed.
 
 An image is divided into 14 x 8 cells of three bands each. A cell or a band has mean colours in
 [-1, 1], and the square roots of the mean absolute differences of brightness between horizontal and
@@ -26,10 +27,11 @@ LEVEL = 1 / 127.5  # of a colour's step, where colours lie in [-1, 1]
 
 
 def texture_features(images: Tensor) -> Tensor:
-    """Texture features (B, C + M) of images uint8 (B, H, W, 3): of all cells, then of the bands of
-    the centre.
+    """Texture features (B, C + M) of images uint8 (B, H, W, 3): the C values of all cells, then the
+    M values of the bands in the image centre.
 
-    H and W must be multiples of the numbers of bands and columns.
+    H must be a multiple of 42 (14 rows of cells with three bands each), W a multiple of 8 (columns
+    of cells).
     """
     sums, pixels = band_sums(images)
     colours = sums[:, :COLOURS] * (LEVEL / pixels) - 1

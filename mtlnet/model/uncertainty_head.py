@@ -81,7 +81,7 @@ class UncertaintyHead(nn.Module):
         """Standard deviations and the OOD score, (B, D + 1).
 
         `x` (B, X): the network's inputs of this head; `textures` (B, C + M): see
-        `mtlnet.model.textures`. A head fitted on fewer inputs reads only the first ones.
+        `mtlnet.model.textures`. A head fitted on fewer inputs reads only the first of these inputs.
         """
         count = min(int(x.shape[1]), len(self.centre))
         z = x[:, :count]
@@ -145,7 +145,8 @@ def load_uncertainty_head(path: Path) -> UncertaintyHead:
 def standardise(x: Tensor, centre: Tensor, scale: Tensor, count: int) -> Tensor:
     """Standardised inputs (N, F) of the standard deviations.
 
-    The first `count` values are the network's; the others are the light, which is clipped.
+    The first `count` inputs are the network's; the remaining inputs are the light, which is
+    clipped.
     """
     z = (x - centre) * scale
     return torch.cat([z[:, :count], z[:, count:].clamp(-LIGHT_LIMIT, LIGHT_LIMIT)], 1)

@@ -1,7 +1,7 @@
 """Finds the camera that took the pictures of a source, for `mtlnet predict`.
 
-The first known of: the camera that the user gives, the camera that a recording states, the camera
-estimated from the pictures of the drive (`mtlnet.calibration`).
+The camera is the first of these that is known: the camera that the user gives, the camera that a
+recording states, the camera estimated from the pictures of the drive (`mtlnet.calibration`).
 """
 
 from dataclasses import replace

@@ -37,7 +37,7 @@ FEATURES = "/features"
 SCHEMA = "driverview.Prediction"
 CODEC = "jpeg"
 SINCE_1970_S = 1e8
-"""Times above this, s, are since 1970 (recordings, streams); others are since the start of a
+"""Times above this, s, are since 1970 (recordings, streams); smaller times are since the start of a
 film."""
 ORANGE = Color(**dict(zip("rgb", (c / 255 for c in PREDICTION_COLOUR), strict=True)), a=1.0)
 

@@ -68,7 +68,7 @@ def predict_files(
     for path in outputs:
         require_other_file(path, [file for source in usable for file in source.files])
     for source in sources:
-        if source.problem and len(sources) > 1:  # the problem of the only one is the error
+        if source.problem and len(sources) > 1:  # the problem of a single source is the error
             note(source.problem)
     if not usable:
         outputs = ()  # what an earlier run wrote stays
@@ -103,7 +103,7 @@ def answer(engine: Engine, item: SourceImage) -> Prediction:
 
 
 def first_of(errors: list[str]) -> str:
-    """The first of some errors, with the number of the others."""
+    """The first of `errors`, with the number of the remaining errors."""
     return f"{errors[0]} (and {len(errors) - 1} more)" if len(errors) > 1 else errors[0]
 
 
@@ -153,7 +153,7 @@ class _Writing:
         self._failed = False
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
-        """Write one answer soon; waits while more than `READ_AHEAD` others wait."""
+        """Write one answer soon; waits while more than `READ_AHEAD` earlier answers wait."""
         if self._writers:
             self._waiting.append(self._thread.submit(self._write, item, prediction))
         while self._waiting and (len(self._waiting) > READ_AHEAD or self._waiting[0].done()):

@@ -165,7 +165,7 @@ class PictureWriter:
 
 
 def view_of(item: SourceImage, model: CameraParameters) -> CameraParameters:
-    """The camera that takes the image in the model's view, from the place of the real camera."""
+    """The camera that takes the image in the model's view, from the position of the real camera."""
     return model if item.lens is None else item.lens.view
 
 

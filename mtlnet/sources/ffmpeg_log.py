@@ -1,7 +1,7 @@
 """Collects the errors that FFmpeg reports while OpenCV decodes a film.
 
-OpenCV hides decoding errors: frames that FFmpeg has patched look like others. They are reported
-only in FFmpeg's log, which by default goes to stderr.
+OpenCV hides decoding errors: frames that FFmpeg has patched look like intact frames. They are
+reported only in FFmpeg's log, which by default goes to stderr.
 """
 
 import atexit
@@ -50,7 +50,7 @@ class DecodingErrors:
         """The new size (width, height) of pictures if it changed; `shape` (H, W, 3) is the first
         picture's.
 
-        A coded size is a multiple of `BLOCK_PX`; that of a rotated film is rotated.
+        A coded size is a multiple of `BLOCK_PX`; the size of a rotated film is rotated.
         """
         if self.size is None:
             return None

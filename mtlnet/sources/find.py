@@ -112,8 +112,8 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def _known(files: list[Path], given: str, note: Note, topic: str) -> list[Source]:
-    """The sources among `files`; a note names the other files, except those usual in a folder of
-    images."""
+    """The sources among `files`; a note names the other files, except files that are usual in a
+    folder of images."""
     kinds = {path: kind_of(path) for path in files}
     sources = [_source(path, kind, topic) for path, kind in kinds.items() if kind is not None]
     others = [path for path, kind in kinds.items() if kind is None and not _is_unremarkable(path)]

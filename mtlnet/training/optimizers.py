@@ -1,4 +1,4 @@
-"""Optimizers: SGD, AdamW, or Muon for the large layers with AdamW for the others.
+"""Optimizers: SGD, AdamW, or Muon for the large layers with AdamW for all other layers.
 
 Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; with it,
 recipe `fast` needed half the images in short trials. It trains the layers whose matrix is cheap:

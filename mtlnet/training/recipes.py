@@ -9,7 +9,7 @@ steps. Dropout 0.5 and L2 5e-4 are our choice, because the paper states neither.
 - Batch normalisation of the convolutions in training, folded away afterwards: training is several
 times faster. The shared layers have none, because batch statistics add noise to the distances.
 The statistics are frozen in the last part of a run: the last convolutions have only some hundred
-places per batch, and the network is then trained in the form in which it is used.
+positions per batch, and the network is then trained in the form in which it is used.
 - The first two convolutions are frozen after a part of the run (FreezeOut, Brock et al. 2017): they
 converge early and take nearly nine tenths of a backward pass. The time saved gives more steps.
 - The heads predict in standard deviations of each target, and the loss is in the same units: the

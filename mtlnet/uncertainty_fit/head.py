@@ -175,10 +175,10 @@ def standardisation(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean (F,) and inverse standard deviation (F,) of inputs (N, F), for `standardise`.
 
-    The first `count` inputs are the network's, the others the light. The standard deviation of a
-    feature counts as at least `MIN_FEATURE_STD_SHARE` of the mean one: a unit that is silent on
-    these frames would otherwise be thousands of deviations away on others. That of the light counts
-    as at least `MIN_LIGHT_STD`.
+    The first `count` inputs are the network's, the remaining inputs the light. The standard
+    deviation of a feature counts as at least `MIN_FEATURE_STD_SHARE` of the mean one: a unit that
+    is silent on these frames would otherwise be thousands of deviations away on other frames. The
+    standard deviation of the light counts as at least `MIN_LIGHT_STD`.
     """
     std = x.std(0)
     floor = max(MIN_FEATURE_STD_SHARE * float(std[:count].mean()), 1e-3)
@@ -236,7 +236,8 @@ def _rms_error(error: NDArray[np.float32]) -> NDArray[np.float32]:
 def _temperatures(ratio: NDArray[np.float32]) -> NDArray[np.float32]:
     """Factors (D,) for the standard deviations, from ratios (N, D) of error to predicted deviation.
 
-    A feature present in fewer than `MIN_PRESENT_FRAMES` frames gets the median of the others.
+    A feature present in fewer than `MIN_PRESENT_FRAMES` frames gets the median factor of the other
+    features.
     """
     present = [column[~np.isnan(column)] for column in ratio.T]
     found = np.array([_temperature(c) if len(c) >= MIN_PRESENT_FRAMES else np.nan for c in present])

@@ -153,9 +153,9 @@ def fit_pitch_offset(
     """Fit the pitch regressor; returns the `pitch*` part of the state of
     `UncertaintyHead`.
 
-    `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: those
-    of `pitched_views`, and their pitches. Scaled so that a share `false_alarm_rate` of the held-out
-    frames has an offset beyond 1.
+    `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: the
+    features from `pitched_views`, and their pitches. Scaled so that a share `false_alarm_rate` of
+    the held-out frames has an offset beyond 1.
     """
     x = np.concatenate([known, views[0]])
     target = np.concatenate([np.zeros(len(known), np.float32), views[1] / PITCH_UNIT_RAD])[:, None]

@@ -56,7 +56,7 @@ class DeviceAugment:
         )
 
     def __call__(self, images: Tensor, params: AugmentParams, seed: int) -> Tensor:
-        """Augmented images uint8 (B, h, W, 3); `seed` is that of the noise."""
+        """Augmented images uint8 (B, h, W, 3); `seed` is the seed of the noise."""
         x = images.permute(0, 3, 1, 2).float()
         x = self._moved(x, params)
         shade = self._shades.index_select(0, self._on(params.shadow)).permute(0, 3, 1, 2)

@@ -1,6 +1,6 @@
 """Augmentation by shadows of trees on the road; each shadow is drawn once and reused.
 
-A network trained on few shaded places mistakes the edges of shadows for markings.
+A network trained on few shaded road sections mistakes the edges of shadows for markings.
 """
 
 from dataclasses import dataclass
@@ -73,10 +73,10 @@ class Drawn:
     """Random numbers of one shadow."""
 
     noise: NDArray[np.float32]  # (FIELD, FIELD)
-    leaves: float  # weight of the leaves; that of the crowns is 1
+    leaves: float  # weight of the leaves; the crowns have a weight of 1
     covered: float  # one of `COVERED`
     rotation: float  # rad, of the field on the road
-    u: float  # cells, the camera's place in the field
+    u: float  # cells, the camera's position in the field
     v: float
     darkness: float  # one of `DARKNESS`
 

@@ -29,9 +29,9 @@ def crop_box(
 ) -> Box | None:
     """The part of a width x height image that `view` shows; None: the whole image.
 
-    `fov_y_deg`: vertical field of view of the image; None: that of `view`. A pinhole camera of
-    focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less than
-    `view`.
+    `fov_y_deg`: vertical field of view of the image; None: the field of view of `view`. A pinhole
+    camera of focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less
+    than `view`.
     """
     ratio = 1.0
     if fov_y_deg is not None:

@@ -2,10 +2,9 @@
 
 Used by `mtlnet predict`, `train`, `evaluate` and `serve`, so that all get the same pixels. The size
 is read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is rotated
-upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop is that of the upright
-image. A wider image is cropped to the model's field of view
-(`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, 16 bits are reduced to
-8.
+upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop refers to the upright image.
+A wider image is cropped to the model's field of view (`mtlnet.inference.image_decoding.crop`).
+Alpha is dropped, grey becomes RGB, 16 bits are reduced to 8.
 
 A service accepts JPEG and PNG (`inspect`, `decode`). A file on this machine may be of another kind
 and is limited only by memory (`read_image`, `read_whole_image`, `decode_file`).
@@ -153,7 +152,8 @@ def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None)
 
     Takes a few ms at most; slower checks are left to `decode`.
 
-    `fov_y_deg`: vertical field of view of the image; None: that of `view`. Raises ImageError.
+    `fov_y_deg`: vertical field of view of the image; None: the field of view of `view`. Raises
+    ImageError.
     """
     header = read_header(body)
     crop_box(header.width, header.height, view, fov_y_deg)

@@ -98,7 +98,8 @@ def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
 
 
 def _read_webp(body: bytes) -> Header:
-    """Source: RFC 9649. The first chunk is a lossy or lossless picture, or describes the others."""
+    """Source: RFC 9649. The first chunk is a lossy or lossless picture, or describes the following
+    chunks."""
     kind, data = body[12:16], body[20:30]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 6)

@@ -1,8 +1,8 @@
 """Fused batch normalisation, max pooling and ReLU for training.
 
 max(relu(a x + b)) = relu(a max(x) + b) for a >= 0. So pooling comes first and saves three quarters
-of the work; where a is negative, the caller negates the filter and a. Statistics are those of the
-batch over all processes (Ioffe and Szegedy 2015, algorithm 1).
+of the work; where a is negative, the caller negates the filter and a. The statistics are computed
+over the batches of all processes (Ioffe and Szegedy 2015, algorithm 1).
 """
 
 from typing import Any

@@ -37,8 +37,8 @@ IMAGES = (ROS_COMPRESSED, ROS_IMAGE, COMPRESSED, RAW, VIDEO)
 def reader_of(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
     """A function from the bytes of a message to its fields; None if the type is not read.
 
-    Foxglove's messages become protobuf messages in any encoding, ROS's those of `rosbags`. The
-    function raises ImageError.
+    Foxglove's messages in any encoding become protobuf messages, ROS's messages become messages of
+    `rosbags`. The function raises ImageError.
     """
     if encoding not in ENCODINGS.get(schema, ()):
         return None

@@ -25,7 +25,7 @@ Terms = Sequence[Tensor]
 
 @dataclass(frozen=True)
 class Losses:
-    """The unweighted loss of each task, as reported, and the minimised sum.
+    """The unweighted loss of each task, as reported, and the weighted sum that training minimises.
 
     `terms` (3,): the term of each task in that sum, before its weight.
     """
@@ -51,7 +51,7 @@ def multi_task_loss(
 ) -> Losses:
     """Losses of outputs (B, 9) for targets coded (B, 6) and heading (B,) int64.
 
-    `total`: computes the minimised sum from the tasks' terms (`TaskWeighting.total`).
+    `total`: computes the sum that training minimises from the tasks' terms (`TaskWeighting.total`).
     `target_variance` (6,): variances of the coded targets. With it, the terms (not the reported
     losses) are in units of these variances, and averaged over the distances: predicting the mean
     then costs about 1 in every task, whatever its range. `huber`: with `target_variance`, Huber

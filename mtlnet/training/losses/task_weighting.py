@@ -53,9 +53,10 @@ class TaskWeighting:
         return [self.log_variance] if self.method == "uncertainty" else []
 
     def total(self, terms: Terms) -> Tensor:
-        """The minimised sum of the tasks' terms.
+        """The weighted sum () of the tasks' loss `terms`, which training minimises.
 
-        The terms of tasks with weight 0 are not part of its graph: a true single-task network.
+        A task with weight 0 has no part in the sum's autograd graph, so a network trained on one
+        task is not influenced by other tasks.
         """
         chosen = torch.stack([terms[number] for number in self._tasks])
         if self.method != "uncertainty":

@@ -61,5 +61,5 @@ def test_a_camera_file_of_other_pictures() -> None:
     given = CameraParameters(1280, 720, matrix=(900.0, 905.0, 640.0, 350.0))
     lens = find_lens((640, 360), MODEL, given)
     assert lens.camera.intrinsics()[0, 0] == pytest.approx(450.0)
-    with pytest.raises(UserError, match="640 x 480 px, those of the camera file 1280 x 720"):
+    with pytest.raises(UserError, match="640 x 480 px, the camera file is for 1280 x 720"):
         find_lens((640, 480), MODEL, given)
