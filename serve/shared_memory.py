@@ -122,8 +122,8 @@ class WorkerPeers:
         return [int(cells[CONNECTIONS]) for cells in self._live()]
 
     def ask_for_room(self, least: int) -> None:
-        """Ask the worker with the most connections to end one of a client that has at least
-        `least` connections."""
+        """Ask the worker with the most connections to end a connection of a client that has at
+        least `least` connections."""
         self._own[ROOM_FOR] = least
         self._own[ROOM_ASKED] += 1
 

@@ -33,7 +33,7 @@ def _in_thread(
 
 
 class AsyncClient:
-    """A connection to the service at `url`; the methods are those of `serve.client.Client`."""
+    """A connection to the service at `url`; it has the methods of `serve.client.Client`."""
 
     def __init__(
         self,

@@ -15,8 +15,8 @@ from serve.scheduling.fair_queue import FairQueue
 
 MAX_PENDING_MS = 1000.0  # cost of all unfinished large images of all clients
 MAX_CLIENT_MS = 250.0  # cost of all unfinished large images of a client; one is always allowed
-SHARE = 0.25  # share of the engine's time for a client's large images if others are present
-MAX_BESIDE_MS = 200.0  # cost of one image if others are present: four frames at 20 Hz
+SHARE = 0.25  # share of the engine's time for a client's large images if other clients are present
+MAX_BESIDE_MS = 200.0  # cost of one image if other clients are present: four frames at 20 Hz
 MAX_CLIENTS = 1024  # number of clients whose credit is remembered
 
 Client = str
@@ -26,7 +26,7 @@ class Admission:
     """Admits large images by their estimated decoding time. Use it in the event loop's thread."""
 
     def __init__(self, waiting: FairQueue) -> None:
-        """`waiting`: the queue, which tells whether other clients are present."""
+        """`waiting`: the queue, which reports whether other clients are present."""
         self._waiting = waiting
         self._pending_ms = 0.0
         self._client_ms: dict[Client, float] = {}  # cost of unfinished images
@@ -53,8 +53,8 @@ class Admission:
         while len(self._credit) >= MAX_CLIENTS:
             self._credit.pop(next(iter(self._credit)))
         self._credit.pop(client, None)
-        # A client with negative credit was alone until now, so its images took no time from others.
-        # Its debt is dropped: a client owes for one image at most.
+        # A client with negative credit was alone until now: its images delayed no other client.
+        # Its debt is dropped: the debt of a client is at most the cost of one image.
         self._credit[client] = (max(credit, 0.0) - cost_ms, now_ns)
         self._client_ms[client] = own + cost_ms
         self._pending_ms += cost_ms

@@ -14,7 +14,7 @@ PRESENT_NS = 1_000_000_000  # a client counts as present for this time after eac
 
 
 class Slot:
-    """A place in the queue: a frame, its client, and the callback for its result."""
+    """An entry of the queue: a frame, its client, and the callback for its result."""
 
     __slots__ = ("client", "frame", "on_result")
 
@@ -25,7 +25,7 @@ class Slot:
 
 
 class FairQueue:
-    """Slots in the order of their arrival. Not thread-safe."""
+    """The queue: one slot for each waiting frame, in the order of arrival. Not thread-safe."""
 
     def __init__(self) -> None:
         self._slots: list[Slot] = []
@@ -33,7 +33,7 @@ class FairQueue:
         self._turns: dict[str, int] = {}  # number of the latest turn of each client
         self._turn = 0
         self._newest: tuple[str, int] = ("", -PRESENT_NS)  # latest client, time in ns
-        self._other: tuple[str, int] = ("", -PRESENT_NS)  # the client before it
+        self._other: tuple[str, int] = ("", -PRESENT_NS)  # the latest other client, time in ns
         self.count = 0
         """Number of slots."""
 
@@ -67,12 +67,13 @@ class FairQueue:
         self._discount(slot)
 
     def of_stream(self, stream: int) -> Slot | None:
-        """The slot of a stream, if it has one."""
+        """The slot of a stream's waiting frame; None if no frame of the stream waits."""
         return next((slot for slot in self._slots if slot.frame.stream == stream), None)
 
     def giving_way_to(self, client: str) -> Slot | None:
-        """The last slot of the client with the most slots, if it has at least two more than
-        `client`; else None."""
+        """The slot that a full queue removes to make room for a frame of `client`: the newest slot
+        of the client with the most slots. None unless that client has at least two slots more than
+        `client`."""
         counts = self._counts
         most = max(counts.values(), default=0)
         if most < counts[network_of(client)] + 2:

@@ -83,8 +83,8 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_after_reply()
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close the connection if it has been idle for DRAIN_S. Returns whether nothing is owed to
-        its client any more."""
+        """Close the connection if it has been idle for DRAIN_S. Returns whether all replies to its
+        client have been sent."""
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
         # Answers sent before draining began had no "Connection: close", so the client can send
         # one more request.
@@ -334,8 +334,8 @@ class GuardedProtocol(HttpToolsProtocol):
             (self.transport.close if idle else self.transport.abort)()
 
     def close_with(self, problem: Problem) -> None:
-        """Send a problem and close. If a reply to an earlier request is owed, send that reply
-        instead."""
+        """Send a problem and close. If an earlier request still waits for its reply, send that
+        reply instead."""
         owed = self._running if self.pipeline or self._phase is Phase.WORK else None
         self._phase = Phase.CLOSING
         now = self.guard.place(self, self.guard.refused)

@@ -4,7 +4,7 @@ Each connection is in one group, according to what it waits for; a group is orde
 waiting, longest first. If the number of connections is at its limit, a new connection ends an old
 one, in this order: refused connections that linger, requests that arrive slowly, connections idle
 for longest (first those that never had an image answered), WebSockets without messages. A new
-connection never ends one of a client that has fewer connections than its own client.
+connection never ends a connection of a client that has fewer connections than its own client.
 """
 
 import time
@@ -57,8 +57,8 @@ class Drained(Guarded, Protocol):
         """Announce in the next reply that it is the last one."""
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close the connection if nothing is owed to its client, `elapsed_s` after
-        `begin_draining`. Returns whether nothing is owed."""
+        """Close the connection if all replies to its client have been sent, `elapsed_s` after
+        `begin_draining`. Returns whether all have been sent."""
 
     def end_draining(self) -> None:
         """End the connection; refuse the requests that are still unanswered."""
@@ -145,7 +145,8 @@ class ConnectionGuard:
         ended.
 
         `least` is the number of connections of the newcomer's client. Clients with fewer
-        connections lose none. If all candidates are too young, clients with more lose young ones.
+        connections lose none. If all candidates are too young, young connections of clients with
+        more than `least` connections are ended.
         """
         for group, age_s, count in (
             (self.refused, 0.0, 0),
