@@ -58,4 +58,4 @@ def train(steps: int, cars: int) -> tuple[float, float]:
 if __name__ == "__main__":
     steps, cars = (int(word) for word in (*sys.argv[1:], *("1000000", "64")[len(sys.argv) - 1 :]))
     first, last = train(steps, cars)
-    print(f"score a step: {first:.3f} at the start, {last:.3f} at the end")
+    print(f"score per step: {first:.3f} at the start, {last:.3f} at the end")

@@ -65,7 +65,7 @@ def tune(config: TuneConfig, as_json: bool) -> None:
     for name, found in content["controllers"].items():
         values = ", ".join(f"{key} {value:.4g}" for key, value in found["parameters"].items())
         typer.echo(
-            f"{name}: {found['reward']:.5f} a step, untuned {found['untuned']:.5f}; "
+            f"{name}: {found['reward']:.5f} per step, untuned {found['untuned']:.5f}; "
             f"{values or 'its own parameters'}"
         )
     typer.echo(f"parameters: {config.out}")
@@ -83,7 +83,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     console = Console(width=max(console.width, TERMINAL_WIDTH))
     for (perception, disturbance), drives in groups(content):
         head, rows = score_table(drives)
-        table = Table(title=escape(f"score a step; perception {perception}, {disturbance} added"))
+        table = Table(title=escape(f"score per step; perception {perception}, {disturbance} added"))
         for title in head:
             table.add_column(escape(title), justify="left" if title == "track" else "right")
         for row in rows:

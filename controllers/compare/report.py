@@ -21,14 +21,14 @@ PAPER_SCORES = {
 }
 """The best scores of the paper's LQR, MPC and RL, over the numbers of steps in `SCORED_STEPS`."""
 FIGURES = (
-    "track", "controller", "score", "score a step", "quadratic a step", "mean |d| (m)",
+    "track", "controller", "score", "score per step", "quadratic per step", "mean |d| (m)",
     "max |d| (m)", "in the lane", "laps", "speed (km/h)", "blind steps", "ended",
 )  # fmt: skip
 TRUTH, PERCEIVED = "#2a9d5c", "#e07a2e"
 
 
 def spread(values: list[float], digits: int) -> str:
-    """The mean of `values`; of several values also the standard deviation."""
+    """The mean of `values`, and their standard deviation if there are several."""
     mean = f"{np.mean(values):.{digits}f}"
     return mean if len(values) == 1 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 

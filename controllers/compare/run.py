@@ -1,8 +1,9 @@
 """The drives of a comparison, and the file with their results.
 
-A controller with `update_batch` makes its drives on the truth at once, others are made one by one.
-`results.json` is {"version", "settings", "drives": [...]} and is written after each batch. A drive
-whose result is in the file is not driven again, unless its controller or model has changed.
+A controller with `update_batch` makes its drives on the truth at once; all other drives are made
+one by one. `results.json` is {"version", "settings", "drives": [...]} and is written after each
+batch. A drive whose result is in the file is not driven again, unless its controller or model has
+changed.
 """
 
 import hashlib

@@ -102,8 +102,8 @@ def caption(text: str, width: int) -> Image:
 def curves(values: NDArray[np.float64], length: int, width: int, span: float, title: str) -> Image:
     """A strip (CURVE_HEIGHT, width, 3) with the curves of true and perceived values (n, 2).
 
-    The strip has `length` places and the last value is at its right edge. `span` is the value at
-    the upper edge; up is positive (left). NaN leaves a gap.
+    The strip has room for `length` values and the last value is at its right edge. `span` is the
+    value at the upper edge; up is positive (left). NaN leaves a gap.
     """
     strip = np.full((CURVE_HEIGHT, width, 3), BACK, np.uint8)
     middle = CURVE_HEIGHT // 2

@@ -42,7 +42,8 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 CARS = 64
-"""Most cars that are driven in one batch: enough that the Python code of a step costs little."""
+"""Largest number of cars in one batch: with so many cars the Python code of a step takes a small
+part of the time."""
 FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
     *("target_lane", "seed", "model", "light"),
@@ -62,7 +63,7 @@ class Outcome:
     """One of many drives."""
 
     number: int
-    """Its place in the list of drives."""
+    """Its index in the list of drives."""
     result: DriveResult | UserError
     """The error of a drive without a result; it has no effect on the other drives."""
     curves: FloatArray

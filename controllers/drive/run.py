@@ -41,7 +41,8 @@ FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
 """The paper's number of steps for each of its tracks."""
 GRID_SHARE = 1.0 / 6.0
-"""TORCS's first place on the grid: distance to the right of the centre over the track's width."""
+"""TORCS's first position on the starting grid: distance to the right of the centre over the track's
+width."""
 TYPICAL_SPEED = 15.0  # m/s, slightly below the speed of gear 1 and THROTTLE on a flat road
 
 START_M, START_S = 5.0, 10.0

@@ -29,7 +29,8 @@ STEP_S = 0.05
 """The control step of the trainings; an actor drives at the same rate."""
 EXACT = LoopConfig(STEP_S)
 RESIDUAL_REACH = 0.3
-"""Steering that the action 1 adds to that of LQR, in [-1, 1]; a bend of 25 m needs about 0.3."""
+"""Steering, in [-1, 1], that the action 1 adds to the steering of LQR; a bend of 25 m radius needs
+about 0.3."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ RESIDUAL = StateDefinition(
 )
 HISTORY_STEPS = 8
 _CHANGE = (0.01, 0.005, 0.01, 0.01)
-"""Typical changes of the first four numbers of the paper's state in a step."""
+"""Typical changes of the first four numbers of the paper's state per step."""
 HISTORY = StateDefinition(
     name="history",
     parts=(

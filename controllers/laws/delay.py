@@ -22,7 +22,7 @@ MAX_DELAY = 4
 """Longest delay in control steps: 0.2 s at 20 Hz."""
 SPANS = (1, 4)
 """Control steps over which second differences are taken: short ones are exact without noise, long
-ones contain more of the motion and no more of the noise."""
+spans contain more of the motion and no more of the noise."""
 LONGEST = max(SPANS)
 WINDOW, FEWEST = 200, 20
 """Largest and least number of control steps that are compared."""
@@ -34,7 +34,7 @@ DELAY_MEMORY = np.dtype(
     [
         # The delay that is assumed: 0 until the measurements contradict it.
         ("steps", np.int64),
-        # Whether it was given, or the measurements ever separated it from all others.
+        # Whether it was given, or the measurements ever separated it from all other delays.
         ("is_known", np.bool_),
         ("is_given", np.bool_),
         ("count", np.int64),

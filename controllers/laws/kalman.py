@@ -48,7 +48,7 @@ sensor a little, and a car that oscillates does not count as a bad sensor."""
 NOISE_STEPS = 100
 """Control steps over which the variance of the noise is averaged."""
 THIRD_DIFFERENCE = 20.0
-"""Variance of a third difference of white noise: 1 + 9 + 9 + 1 times that of the noise."""
+"""Variance of a third difference of white noise: 1 + 9 + 9 + 1 times the variance of the noise."""
 
 
 STATE_MEMORY = np.dtype(
@@ -67,7 +67,7 @@ STATE_MEMORY = np.dtype(
 )
 """The memory of the estimate of one car; zeros at the start, but for the last speed."""
 SPEED = 2
-"""Place of vx in the field `last`."""
+"""Index of vx in the field `last`."""
 
 
 class StateEstimate:

@@ -139,7 +139,8 @@ def regulate_smoothly(
     steady_bends: Matrix,
 ) -> Matrix:
     """The steering actions (N,) of `LqrKalman` for cars at `speeds` (N,) with estimated `states`
-    (N, 5) and `delays` (N,). `wheel_angles` (N,) are replaced; the others are rows of tables."""
+    (N, 5) and `delays` (N,). `wheel_angles` (N,) are replaced; the remaining arguments are rows of
+    tables by speed."""
     steers = np.empty(len(states))
     for k in range(len(states)):
         offset, theta, curvature = states[k, E], states[k, THETA], states[k, KAPPA]
@@ -161,7 +162,8 @@ def regulate_smoothly(
 def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:
     """The gain K (5,) of change = -K (e1, e1', e2, e2', wheel angle), all minus their set points.
 
-    The change of the wheel angle, in rad, is that of one control step of `dt` s at `speed` m/s.
+    The change, in rad, is the change of the wheel angle over one control step of `dt` s at `speed`
+    m/s.
     """
     A, B = CAR.discretise(speed, dt)
     states = np.block([[A, B], [np.zeros((1, 4)), np.eye(1)]])

@@ -46,8 +46,8 @@ class RlController:
 def load_controller(folder: Path, loop: LoopConfig = EXACT) -> RlController:
     """The controller of the actor in `folder`.
 
-    Raises ActorError for unusable files and UserError for a control step other than that of the
-    training.
+    Raises ActorError for unusable files and UserError for a control step other than the control
+    step of the training.
     """
     if loop.dt != STEP_S:
         raise UserError(f"{folder.name} was trained for steps of {STEP_S:g} s, not {loop.dt:g}")

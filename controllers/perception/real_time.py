@@ -136,7 +136,8 @@ class RealTimeFigures:
     """Age of the newest answer at a control step."""
     age_ms_p99: float
     missed_steps: int
-    """Control steps that took longer than their 50 ms, or began late because of such a step."""
+    """Control steps that took longer than their 50 ms, or began late because an earlier step
+    did."""
 
 
 class RealTimePerception(Generic[World, Frame, Answer]):

@@ -1,8 +1,8 @@
 """The steering law of a recorded round: a controller on a model's perception.
 
-Course, speed, traffic and light of the round are those of `datagen collect`. The controller follows
-the course by the model's answer to each image, so that the car reaches the states to which the
-model's errors lead (DAgger, Ross et al. 2011). The recorded labels are the simulator's truth.
+Course, speed, traffic and light of the round are the same as in `datagen collect`. The controller
+follows the course by the model's answer to each image, so that the car reaches the states to which
+the model's errors lead (DAgger, Ross et al. 2011). The recorded labels are the simulator's truth.
 
 Two inputs come from the simulator: the positions of the other cars, and the lane from which the
 answered offset is measured, because an image shows only the lane that the car is in.

@@ -37,7 +37,7 @@ class Replay:
         self.added += 1
 
     def sample(self, places: NDArray[np.int64]) -> Batch:
-        """The transitions at `places` (B,), copied."""
+        """Copies of the transitions with the indices `places` (B,)."""
         results = self.results[places]
         return Batch(
             self.states[places],

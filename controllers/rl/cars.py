@@ -34,7 +34,7 @@ PERCEIVED = (0, 1, 4, 5, 6)
 """The numbers of the paper's state that the perception measures; the car's speeds are not late."""
 EPISODE_STEPS = (200, 800)
 STANDING = 0.25
-"""Share of the cars that start at rest; the others roll."""
+"""Share of the cars that start at rest; all other cars start in motion."""
 START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}
 START_SPEED = (0.0, 18.0)
 GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
@@ -56,7 +56,8 @@ class Step:
 
 
 class Cars:
-    """N cars on `tracks` (N names); those of `disturbed` (N,) differ in each episode.
+    """N cars on `tracks` (N names). The cars in the mask `disturbed` (N,) have other parameters in
+    each episode.
 
     `starts`: options of the reset; `episode`: least and greatest number of steps of an episode.
     """
@@ -148,7 +149,7 @@ class Cars:
     def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
         """The states (N, size); the memory of `new` cars (N,) begins with their present state.
 
-        With `new` cars only their states are valid, and the memory of the others stays.
+        With `new` cars only their states are valid, and the memory of all other cars is unchanged.
         """
         exact = observed.copy()
         exact[:, 0] = info["to_middle"] / self._half_width_m
@@ -188,11 +189,11 @@ def random_cars(
     disturbed: float,
     **options: Any,
 ) -> Cars:
-    """`count` cars that start at random places and motions: of each two cars one on the next of
-    `tracks`, the other on random roads, with one track all on it.
+    """`count` cars that start at random positions and speeds. The cars drive alternately on the
+    next of `tracks` and on random roads; with one track all cars drive on it.
 
-    `disturbed`: share of the disturbed cars, evenly spread over the tracks; `options`: those of
-    `Cars` that are not set here.
+    `disturbed`: share of the disturbed cars, evenly spread over the tracks; `options`: the options
+    of `Cars` that are not set here.
     """
     several = len(tracks) > 1
     pairs = np.arange(count) // (2 if several else 1)

@@ -31,7 +31,7 @@ def train(config: TrainConfig, as_json: bool) -> None:
 
         result = run(config, report)
     line = (
-        f"best {config.reward} reward a step on {config.track}: "
+        f"best {config.reward} reward per step on {config.track}: "
         f"{result['best_score_per_step']:.4f} at step {result['best_step']}; drive it with: "
         f"controllers drive --controller {config.out}"
     )

@@ -44,7 +44,8 @@ class Algorithm:
     state_noise: float = 0.05
     """Standard deviation of the noise on the state."""
     random_starts: bool = False
-    """Whether episodes are of 400 steps from a random place and motion; the paper's have 6500."""
+    """Whether episodes have 400 steps from a random position and speed; the paper's episodes have
+    6500 steps."""
     mirrored: bool = False
     """Whether left and right are exchanged in half of the transitions, and the actor is odd."""
     scaled: bool = False
@@ -85,7 +86,7 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """The settings of `ppo`; names without a comment are those of Schulman et al. 2017."""
+    """The settings of `ppo`; names without a comment are the names of Schulman et al. 2017."""
 
     discount: float = 0.97
     gae_lambda: float = 0.95
@@ -187,7 +188,7 @@ class TrainConfig:
 
     @property
     def vectorised(self) -> bool:
-        """Whether the cars are those of a vector environment."""
+        """Whether the cars are the cars of a vector environment."""
         return self.algorithm == PPO or (self.envs or 1) > 1
 
 

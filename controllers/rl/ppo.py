@@ -172,7 +172,8 @@ class Ppo:
     def learn(
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
     ) -> dict[str, float]:
-        """Add a step; every `horizon` steps update the networks and return figures of the update.
+        """Add a step of the cars; every `horizon` steps update the networks and return figures of
+        the update.
 
         `left`: share of the training that is left.
         """

@@ -145,7 +145,7 @@ class _Training:
         return Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Options of the reset: {} for the paper's start, or a random place and motion."""
+        """Options of the reset: {} for the paper's start, or a random position and speed."""
         if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
         return {

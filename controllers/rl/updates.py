@@ -54,7 +54,8 @@ class Trained:
 def critic_update(
     actor: Trained, critics: Trained, batch: Batch, noise: Array, discount: float
 ) -> float:
-    """Fill the critics' gradients with those of their mean squared error; returns the error.
+    """Fill the critics' gradients with the gradients of their mean squared error; returns the
+    error.
 
     The target is r + discount min Q'(s', mu'(s') + noise); `noise` is (B,).
     """

@@ -27,7 +27,8 @@ from simulator.track.catalogue import find_track, list_tracks
 from trackfeatures.errors import UserError
 
 EVALUATION_STEPS = 6500
-"""Steps of an evaluation's drive on each track, from TORCS's place on the grid."""
+"""Steps of an evaluation's drive on each track, from TORCS's first position on the starting
+grid."""
 HALF_WIDTH_M = 5.5
 """Divisor of the offset in a training on all tracks: half the width of forza."""
 Report = Callable[[int, float], None]
@@ -181,10 +182,11 @@ class _Training:
                 self._report(min(progress.step, self._steps), progress.best_score)
 
     def _evaluate(self) -> tuple[float, float, float]:
-        """Reward a step, mean and largest offset (m) of a drive on each track without noise.
+        """Reward per step, mean offset and largest offset (m) of the drives without noise, one on
+        each track.
 
-        As in `controllers drive`, the steps after an early end count 0, with the quadratic reward
-        OFF_TRACK_REWARD.
+        As in `controllers drive`, each step after an early end counts 0, or OFF_TRACK_REWARD with
+        the quadratic reward.
         """
         cars = self._evaluated
         states = cars.reset(0)

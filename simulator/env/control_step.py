@@ -75,8 +75,8 @@ lambda; bound of the states; angles (B,) of the beams."""
 def step_cars(
     begin: int, end: int, fleet: Arrays, steps: int, outputs: Outputs, rules: Rules
 ) -> None:
-    """Advance the cars from `begin` to before `end` by a control step of `steps` physics steps, and
-    observe those that completed it."""
+    """Advance the cars `begin` to `end` - 1 by a control step of `steps` physics steps, and observe
+    the cars that completed it."""
     work, lent, filled = make_work(), lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         if advance_car(number, lent, steps, lend_work(work)):
@@ -87,7 +87,8 @@ def step_cars(
 def observe_cars(
     begin: int, end: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool
 ) -> None:
-    """Observe the cars from `begin` to before `end` after a step, or `first` in an episode."""
+    """Observe the cars `begin` to `end` - 1: after a step or, with `first`, at the start of an
+    episode."""
     lent, filled = lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         observe_car(number, lent, filled, rules, first)

@@ -103,7 +103,8 @@ os.register_at_fork(after_in_child=_close_in_child)
 
 
 def check_name(name: str) -> str:
-    """`name` itself. Raises LinkError unless it can name a segment everywhere: /letters."""
+    """Return `name`. Raises LinkError unless it is a valid name of shared memory on every system: a
+    slash and then a plain name."""
     if not name.startswith("/") or len(name) < 2:
         raise LinkError(f"the link's name is {name!r}; it begins with a slash: /driverview")
     if "/" in name[1:] or "\0" in name or name in ("/.", "/.."):

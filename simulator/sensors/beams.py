@@ -115,8 +115,8 @@ def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
 def crosses_end(
     along: float, k: float, u: float, v: float, cu: float, cv: float, move: int
 ) -> float:
-    """Ray distance (m) at which it crosses the normal of the centre line `along` m from the start
-    of the piece."""
+    """Distance (m) along the ray at which the ray crosses the normal of the centre line `along` m
+    from the start of the piece."""
     half_turn = 0.5 * along * k
     sin_half, cos_half = math.sin(half_turn), math.cos(half_turn)
     chord = along if half_turn == 0.0 else along * sin_half / half_turn

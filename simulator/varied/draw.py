@@ -35,13 +35,15 @@ def ranges() -> Tables:
 
 
 def drawn_as(kind: type[Kind], section: str, rng: np.random.Generator) -> Kind:
-    """An object of the dataclass `kind`, its fields drawn from the section of that name."""
+    """An object of the dataclass `kind`, whose fields are random values of the section
+    `section`."""
     values = draw(ranges(), section, rng)
     return kind(**{f.name: values[f.name] for f in fields(kind) if f.name in values})  # type: ignore[arg-type]
 
 
 def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
-    """The values of the table `name`, drawn after those of the table that its `like` names."""
+    """Random values of the table `name`. If the table has the entry `like`, the values of the table
+    that `like` names come first; the table's own entries replace them."""
     table = tables[name]
     drawn: Values = draw(tables, table["like"], rng) if "like" in table else {}
     for entry, value in table.items():

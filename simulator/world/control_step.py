@@ -121,7 +121,7 @@ def measure_car(table: Table, car: FloatArray) -> None:
 
 @compiled_for_threads
 def advance_cars(begin: int, end: int, fleet: Arrays, steps: int) -> None:
-    """Advance the cars from `begin` to before `end` by a control step."""
+    """Advance the cars `begin` to `end` - 1 by a control step of `steps` physics steps."""
     work, lent = make_work(), lend(fleet)
     for number in range(begin, end):
         advance_car(number, lent, steps, lend_work(work))

@@ -43,7 +43,7 @@ PROGRAMS = (
 )
 FRAME_BINDING, SCENE_BINDING, LOOK_BINDING = 0, 1, 2
 VERTEX_SHADERS = {"paved": "road", "verge": "road"}
-"""Programs that use the vertex shader of another name."""
+"""Programs that use another program's vertex shader, and the name of that program."""
 LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
 """Functions for fragment shaders."""
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING, "Look": LOOK_BINDING}

@@ -40,5 +40,5 @@ class ViewRequest:
 
 
 def bounded(picture: NDArray[Any]) -> NDArray[Any]:
-    """`picture`; the depth of the sky, if it is one of depth, is FAR_M instead of infinity."""
+    """`picture`; in a depth image the depth of the sky is changed from infinity to FAR_M."""
     return np.minimum(picture, FAR_M, out=picture) if picture.dtype == np.float32 else picture

@@ -59,7 +59,8 @@ class Imaging:
             )
 
     def developed(self, picture: Picture, eye: Eye, s: float) -> Picture:
-        """The recorded picture for the rendered one (H, W, 3) from `eye`, `s` m along the road."""
+        """The recorded picture (H, W, 3) made from the rendered `picture` (H, W, 3) of `eye`, `s` m
+        along the road."""
         lens = self._lens
         if self._night:
             picture = _with_glow(picture)

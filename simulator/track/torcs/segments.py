@@ -27,7 +27,8 @@ Edges = NDArray[np.float64]
 
 @dataclass
 class Profile:
-    """Values that a segment passes to the next: end heights, end slopes and the sticky grade."""
+    """Values that a segment passes to the next segment: end heights, end slopes, and the grade,
+    which holds until a segment states another grade."""
 
     end: Edges
     tangent: Edges
