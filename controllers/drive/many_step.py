@@ -98,7 +98,7 @@ def command_rides(fleet: Arrays, rides: RideArrays, steers: FloatArray, frequenc
 def observe_rides(
     begin: int, end: int, fleet: Arrays, rides: RideArrays, steps: int
 ) -> tuple[int, int]:
-    """Observe those of the cars `begin` to `end` - 1 whose control step of `steps` physics steps is
+    """Observe the cars among `begin` to `end` - 1 whose control step of `steps` physics steps is
     complete; a car whose drive is over is left out of later steps (SKIPPED).
 
     Returns how many drives go on, and how many cars did not complete their step.
