@@ -1,12 +1,11 @@
 """The state vector that an actor receives; training and driving share its definitions.
 
-`paper`: the paper's seven numbers (`trackfeatures.state_vector`).
-`stacked`: d/w, angle/pi, v_x and v_y over 75 km/h, left minus right, the yaw rate (rad/s), the
-changes of the first two since the last step, and the last two steering actions. The curvature of
-the road can be inferred from them; the paper's state does not contain it. LQR also receives the yaw
-rate.
-`residual`: `stacked` and the steering of the controller `lqr`. 0.3 times the actor's action is
-added to that steering (Johannink et al. 2019, residual reinforcement learning).
+`paper`: the paper's seven numbers (`trackfeatures.state_vector`). `stacked`: d/w, angle/pi, v_x and
+v_y over 75 km/h, the class of the road as a number (left 1, straight 0, right -1), the yaw rate
+(rad/s), the changes of the first two since the last step, and the last two steering actions. The
+curvature of the road can be inferred from them; the paper's state does not contain it. LQR also
+receives the yaw rate. `residual`: `stacked` and the steering of the controller `lqr`. 0.3 times the
+actor's action is added to that steering (Johannink et al. 2019, residual reinforcement learning).
 `history`: the paper's state of the last eight steps: that of the present step, and those of the
 seven steps before as differences from it. Noise, delay and the car's motion can be inferred.
 
