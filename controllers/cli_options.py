@@ -33,7 +33,8 @@ Tracks = Annotated[str, "Names of tracks, or their files, separated by commas."]
 TracksDir = Annotated[Path | None, "A further folder to search for tracks."]
 Steps = Annotated[
     int | None,
-    "Control steps of 50 ms. Default: the paper's number on its tracks, about a lap on others.",
+    "Control steps of 50 ms. Default: the paper's number on its tracks, about a lap on other "
+    "tracks.",
 ]
 MODELS = 'run folder, name in runs/, "latest", or "default" (the shipped model).'
 Model = Annotated[str, f"Model of --perception model: {MODELS}"]

@@ -73,7 +73,8 @@ def snapshot(
     ] = None,
     tracks_dir: TracksDir = None,
 ) -> None:
-    """Write a contact sheet of views with the true markings drawn on them, or depth or classes."""
+    """Write a sheet of camera views with the true markings drawn on them, or of depth or class
+    images."""
     from runtime.camera_file import read_camera
     from simulator.camera.snapshot import write_contact_sheet
     from simulator.track.catalogue import find_track

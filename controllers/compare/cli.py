@@ -16,8 +16,8 @@ TERMINAL_WIDTH = 120  # columns that the tables need
 def compare(config: CompareConfig, as_json: bool) -> None:
     """Drive every controller on every track and print the paper's table.
 
-    One lane, standing start, throttle 0.2 in gear 1. The same command continues an interrupted
-    comparison: it skips the drives whose results are in the folder.
+    The cars drive on one lane, from a standing start, with throttle 0.2 in gear 1. The same command
+    continues an interrupted comparison: it skips the drives whose results are in the folder.
     """
     from rich.markup import escape
 

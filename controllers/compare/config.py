@@ -35,8 +35,8 @@ class CompareConfig:
     steps: options.Steps = None
     start_d: Annotated[
         float | None,
-        "Start, m left of the track's centre. Default: TORCS's place on the grid, a sixth of the "
-        "track's width to the right.",
+        "Start, m left of the track's centre. Default: TORCS's position on the starting "
+        "grid, a sixth of the track's width to the right.",
     ] = None
     latency_ms: options.Latency = 0.0
     drop: options.Drop = 0.0

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @options(DriveConfig)
 def drive(config: DriveConfig, as_json: bool) -> None:
-    """Drive closed loop from 25 m before the line, at rest, and print the score.
+    """Drive in closed loop, from rest 25 m before the start line, and print the score.
 
     Gear 1 and the throttle are held, with less throttle behind slower traffic; --speed replaces
     both. The score is the sum of the rewards over the requested steps. The drive ends early when

@@ -68,8 +68,8 @@ class RecordConfig:
 def record(config: RecordConfig, as_json: bool) -> None:
     """Record rounds with true labels while a controller steers on a model's answers.
 
-    The rounds are planned like the rounds of `datagen collect`. The controller follows their
-    courses, which sway and leave the lane, at their speed and in their traffic. A car that leaves
+    The rounds are planned like the rounds of `datagen collect`, with the same speeds and traffic.
+    The controller follows the course of a round, which sways and leaves the lane. A car that leaves
     the road or hits something is put back onto the road. The same command continues an interrupted
     dataset.
     """

@@ -152,8 +152,8 @@ class TrainConfig:
     disturbed: Annotated[
         float,
         Option(
-            help="Share of several cars with another friction, mass and throttle in each episode, "
-            "and with noise and delay of their state.",
+            help="With several cars: share with random friction, mass and throttle in each "
+            "episode, and with noise and delay of their state.",
             min=0.0,
             max=1.0,
         ),

@@ -68,13 +68,16 @@ def export(
     ] = None,
     split: Annotated[
         str,
-        typer.Option(help="Side of the split: train, test, unseen, or all (files by side)."),
+        typer.Option(
+            help="Side of the split to export: train, test, unseen, or all, which writes separate "
+            "files for each side."
+        ),
     ] = "all",
     shard_size: Annotated[int, typer.Option(help="webdataset: frames per shard.")] = 1000,
     shuffle: Annotated[
         bool,
         typer.Option(
-            "--shuffle", help="webdataset: frames in a fixed random order instead of in time."
+            "--shuffle", help="webdataset: frames in a fixed random order instead of by time."
         ),
     ] = False,
     as_json: AsJson = False,

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 Level = Annotated[
     str,
-    typer.Option(help="quick: file ends, counts. full: every byte. deep: every image and label."),
+    typer.Option(
+        help="Checks: quick, the end of each file and its message counts; full, every byte; "
+        "deep, also every image and label."
+    ),
 ]
 Replay = Annotated[
     int, typer.Option(help="Simulate this many rounds again: their labels must be bit-equal.")
@@ -80,7 +83,10 @@ def recover(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A damaged round.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="File to write. Default: beside FILE; DIR/recovered for DIR/rounds."),
+        typer.Option(
+            help="File to write. Default: a new file beside FILE, or in DIR/recovered if FILE is "
+            "in DIR/rounds."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -28,9 +28,9 @@ def protocol(
 ) -> None:
     """Record the test data of the paper's protocol, for `mtlnet evaluate --protocol paper`.
 
-    A lap near the middle of g-track-3 and of dirt-3, in clear light and in heavy shadow, and rounds
-    on the paper's nine tracks. Needs the tracks of TORCS. The same command continues an interrupted
-    recording.
+    The data are laps near the middle of g-track-3 and of dirt-3, each in clear light and in heavy
+    shadow, and rounds on the paper's nine tracks. The tracks of TORCS are needed. The same command
+    continues an interrupted recording.
     """
     from datagen.planning.class_balance import TrackForecast
     from datagen.planning.protocol import protocol_plan

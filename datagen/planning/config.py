@@ -51,7 +51,7 @@ TestShare = Annotated[
 Stretch = Annotated[
     int,
     Option(
-        help="Frames after which scenery, light and weather change; 0: never, a round is a film. "
+        help="Frames after which scenery, light and weather change; 0: they never change. "
         "Use 1 for training sets."
     ),
 ]
@@ -63,7 +63,7 @@ Scenes = Annotated[
     ),
 ]
 SplitName = Annotated[
-    str, Option(help="unseen: record the tracks that are held out of training plans.")
+    str, Option(help="unseen: record only the tracks that training plans leave out.")
 ]
 
 

@@ -52,8 +52,8 @@ class TrainConfig:
     balance: Annotated[
         str,
         Option(
-            help="Method that sets the task weights: fixed (those of --alpha), uncertainty or dwa; "
-            "the last two use --alpha only to select tasks."
+            help="Method that sets the task weights: fixed (the values of --alpha), uncertainty or "
+            "dwa; the last two use --alpha only to select tasks."
         ),
     ] = "fixed"
     recipe: Annotated[

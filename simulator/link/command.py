@@ -20,7 +20,7 @@ Name = Annotated[str, typer.Option(help="Name of the shared memory, such as /dri
 Track = Annotated[str, typer.Option(help="Name of a track, or a track file.")]
 Frequency = Annotated[int, typer.Option(help="Control steps per second; a divisor of 200.")]
 Seed = Annotated[
-    int, typer.Option(help="Seed of scenery, light, and episodes without a seed.", min=0)
+    int, typer.Option(help="Seed of scenery and light, and of resets without a seed.", min=0)
 ]
 CameraSize = Annotated[str, typer.Option(help="Image size in pixels, such as 280x210, or none.")]
 LightName = Annotated[str, typer.Option(help="Light of the images, such as clear or rain.")]
@@ -29,7 +29,8 @@ Realtime = Annotated[
     bool,
     typer.Option(
         "--realtime/--lock-step",
-        help="Step by the wall clock and hold the last command, or wait for each command.",
+        help="Step by the wall clock and hold the last command, or wait for a command before each "
+        "step.",
     ),
 ]
 Once = Annotated[bool, typer.Option("--once", help="End when the first client disconnects.")]

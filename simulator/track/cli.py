@@ -56,7 +56,7 @@ def plot(
     lanes: Lanes = 1,
     tracks_dir: TracksDir = None,
 ) -> None:
-    """Draw a track: plan, and height, curvature and heading class along the lap, as PNG."""
+    """Draw a track as PNG: its plan, and height, curvature and class of the road along the lap."""
     from simulator.track.catalogue import find_track
     from simulator.track.plot import write_plot
     from simulator.track.road import Road
@@ -76,7 +76,7 @@ def export(
         Path | None, typer.Option(help="TOML file to write. Default: random-SEED.toml.")
     ] = None,
 ) -> None:
-    """Write a random road as a TOML track, which can be edited and driven by its path."""
+    """Write a random road as a TOML file; commands accept the file's path as a track."""
     from simulator.track.random_roads.export import write_road
     from simulator.track.random_roads.road import seed_of
 

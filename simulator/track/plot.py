@@ -1,4 +1,4 @@
-"""A picture of a track: its plan, and height, curvature and heading class along the lap.
+"""A picture of a track: its plan, and height, curvature and class of the road along the lap.
 
 simulator tracks plot NAME --out FILE.png --lanes 2
 """
