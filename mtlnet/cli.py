@@ -59,8 +59,8 @@ def ablate_command(
     dry_run: options.DryRun = False,
     as_json: command.AsJson = False,
 ) -> None:
-    """Train and evaluate the paper's ablation table: each task alone, MTL 1 to 4, two other
-    networks."""
+    """Train and evaluate the rows of the paper's ablation table: each task alone, four task
+    weightings (MTL 1 to 4), and two other networks."""
     from mtlnet.ablation.plan import ablation_rows
     from mtlnet.ablation.run import ablate
 

@@ -139,8 +139,8 @@ def regulate_smoothly(
     steady_bends: Matrix,
 ) -> Matrix:
     """The steering actions (N,) of `LqrKalman` for cars at `speeds` (N,) with estimated `states`
-    (N, 5) and `delays` (N,). `wheel_angles` (N,) are replaced; the remaining arguments are rows of
-    tables by speed."""
+    (N, 5) and `delays` (N,). `wheel_angles` (N,) is updated in place; the remaining arguments are
+    rows of tables by speed."""
     steers = np.empty(len(states))
     for k in range(len(states)):
         offset, theta, curvature = states[k, E], states[k, THETA], states[k, KAPPA]

@@ -120,8 +120,9 @@ def plan_cars(
 ) -> Vector:
     """The steering actions (N,) for the rows of `Observations` (N, OBSERVED).
 
-    Replaced are the `plans` (N, n) and, where no curvature is measured, its estimates `curvatures`
-    (N,). Without `preview` the curvature of the reference is 0.
+    The plans (N, n) of the last step are replaced by the new plans. Where no curvature is measured,
+    its estimate in `curvatures` (N,) is updated, too. Without `preview` the curvature of the
+    reference is 0.
     """
     steers = np.empty(len(seen))
     for k in range(len(seen)):

@@ -114,7 +114,8 @@ class ConnectionGuard:
             self.open[connection.network] += 1
 
     def place(self, connection: Guarded, group: Group) -> float:
-        """Move a connection to the end of a group; returns the time in s."""
+        """Move a connection to the end of a group, from which its waiting time counts; returns the
+        clock's time in s."""
         connection.group.pop(connection, None)
         connection.group = group
         group[connection] = None

@@ -46,7 +46,7 @@ def ending_code(off_track: bool, backwards: bool, wall: bool, touched: bool, end
 
 
 def ends_code(ends: Collection[Ending]) -> int:
-    """The events as bits, in the order of ENDINGS."""
+    """A bit mask of the events `ends`: bit k stands for ENDINGS[k]."""
     return sum(1 << k for k, event in enumerate(ENDINGS) if event in ends)
 
 
