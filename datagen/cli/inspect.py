@@ -37,7 +37,7 @@ def stats(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write an HTML page: distributions, class balance, concerns (faults of the data), sample frames."""
+    """Write an HTML page: distributions, class balance, concerns (data faults), sample frames."""
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
     from datagen.stats.page import concerns, page
