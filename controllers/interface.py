@@ -111,4 +111,4 @@ class LoopConfig:
     noisy: bool = False
     """Whether a perception estimates the state, with errors; otherwise the state is exact."""
     delay_s: float | None = None
-    """By how much the perceived offset and angle are late, s; None if it is unknown."""
+    """Delay of the perceived offset and angle, s; None if it is unknown."""

@@ -180,7 +180,7 @@ def too_slow(part: str, limit_s: float) -> Problem:
 
 
 def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
-    """The members of every problem."""
+    """The members that every problem has, by name."""
     return {"type": type_uri, "title": title, "status": status, "detail": detail}
 
 

@@ -89,7 +89,8 @@ def names(text: str, what: str) -> list[str]:
 
 
 def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str, Any]:
-    """Drive all cells without a result in `config.out`; returns the results of all cells.
+    """Make all drives of the comparison (cells) that have no result in `config.out`; returns the
+    results of all.
 
     Raises UserError before the first drive for an unknown name, a folder with results of other
     settings, or a folder to which another process writes. Raises ContactsUnavailable after the last

@@ -24,7 +24,7 @@ SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S = 0.1, 0.01
 NOISE_STD = np.array(
     (OFFSET_NOISE_M, ANGLE_NOISE_RAD, SPEED_NOISE_M_S, SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S)
 )
-"""Of offset, angle, vx, vy and yaw rate."""
+"""Standard deviations of the noise on offset, angle, vx, vy and yaw rate."""
 DELAY_S = 0.1
 """Delay of the perception."""
 GUST_M_S, GUST_S = 6.0, 1.5
@@ -147,7 +147,7 @@ class Gusts:
 
 
 class WindyWorld(World):
-    """A world with side wind, whose force acts at the centre of gravity, once a control step."""
+    """A world with side wind, whose force acts at the centre of gravity once per control step."""
 
     def __init__(
         self, road: Road, gusts: Gusts, *, traffic: int, frequency_hz: int, car: CarParameters

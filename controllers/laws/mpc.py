@@ -98,7 +98,7 @@ class Mpc:
     ) -> None:
         self.dt, self.weights, self.horizon, self.preview = dt, weights, horizon, preview
         self.plans: Vector = np.zeros((0, horizon))
-        """Of each car the planned front wheel angles (rad), for each step of the horizon."""
+        """Planned front wheel angles (rad) of each car, one for each step of the horizon."""
         self._cost = np.array([weights.offset, weights.heading, weights.wheel])
         self._curvatures = np.zeros(0)
         self.update_batch(Observations(np.zeros((0, OBSERVED))))  # compiles

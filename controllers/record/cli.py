@@ -45,7 +45,8 @@ FIRST_SEED = 1000
 
 @dataclass(frozen=True)
 class RecordConfig:
-    """One recording; all options but the first two are also options of `datagen collect`."""
+    """One recording. All options except the controller and the model are also options of `datagen
+    collect`."""
 
     controller: options.ControllerName = "lqr"
     model: Annotated[str, f"Model that perceives: {options.MODELS}"] = "default"

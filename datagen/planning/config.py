@@ -174,8 +174,8 @@ LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
 
 @dataclass(frozen=True)
 class ProtocolConfig:
-    """Options of `datagen protocol`; by default as many rounds and images as the paper's 30,000.
-    Raises UserError for drives of no length."""
+    """Options of `datagen protocol`. By default 15 rounds of 2,000 images are recorded, as many
+    images as the paper has. Raises UserError for drives of zero length."""
 
     rounds: Annotated[int, Option(help="Rounds on the nine tracks.")] = 15
     frames: Annotated[int, Option(help="Frames per round on the nine tracks.")] = 2000

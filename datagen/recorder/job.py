@@ -1,6 +1,6 @@
 """Records one round into a dataset folder, checked and atomically; and the recording process.
 
-Used by the processes on this machine and by Ray actors.
+The processes on this machine and Ray actors use this module.
 """
 
 import ctypes

@@ -1,4 +1,5 @@
-"""Records one round: simulate, render, measure, write. A pure function of its plan entry."""
+"""Records one round: simulates, renders, measures and writes it. The recorded round is a pure
+function of its plan entry."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Segments:
-    """Segments of bars (N,): middle u, v; slope du/dv with its standard deviation; number of
-    rows."""
+    """N straight segments of markings in a picture: middle u, v (px); slope du/dv with its standard
+    deviation; number of rows that the segment covers."""
 
     u: FloatArray
     v: FloatArray

@@ -1,6 +1,6 @@
 """A user's own labelled pictures (a folder with `labels.csv`), rectified to the model's camera.
 
-Used by `mtlnet train --init RUN` and `mtlnet evaluate`. The camera of a picture is the camera file
+`mtlnet train --init RUN` and `mtlnet evaluate` use them. The camera of a picture is the camera file
 named in its row, else `camera.yaml` in the folder, else the model's camera. Pictures of another
 camera than the model's are rectified (`mtlnet.inference.rectification`).
 """

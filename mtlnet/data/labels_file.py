@@ -267,7 +267,7 @@ def _number(name: str, text: str) -> float:
 def lane_cells(ml: float, mr: float) -> Cells:
     """Cells of the five distances, from the two markings (m) of the car's lane.
 
-    By the definitions of the features: `ml` and `mr` are present from 0.5 m to both markings on.
+    The definitions of the features apply: `ml` and `mr` are present from 0.5 m to both markings on.
     Over 1.2 m from both markings there is no `m`; otherwise `m` is the nearer marking, and the
     markings beyond it are unknown.
     """

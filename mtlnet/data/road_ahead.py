@@ -5,7 +5,7 @@ recorded with every image; px from the upper left corner of the image. Curvature
 `AHEAD_M` in front of the car, 1/m, positive to the left, from the labels of all frames of the same
 track. NaN where unknown: outside the image, or where no frame was recorded nearby.
 
-Used only in training (`mtlnet.model.auxiliary`).
+These labels are used only in training (`mtlnet.model.auxiliary`).
 """
 
 from collections.abc import Sequence

@@ -1,1 +1,1 @@
-"""Evaluation: metrics, the report page, and the ablation of the paper."""
+"""Evaluation of a model: metrics, report pages, the paper's protocol, and a user's own pictures."""

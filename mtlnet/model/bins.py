@@ -127,7 +127,7 @@ def expectation(scores: Tensor) -> Tensor:
 def log_spreads(distance: Tensor, angle: Tensor) -> Tensor:
     """Logarithms (B, 6) of the standard deviations, in bins, of the distributions of the scores.
 
-    Over all bins except "absent", so that two separate peaks count as a wide distribution.
+    All bins except "absent" count, so that two separate peaks are a wide distribution.
     """
     spreads = [_log_spread(distance[:, :, :-1]), _log_spread(angle)[:, None]]
     return torch.cat(spreads, 1)

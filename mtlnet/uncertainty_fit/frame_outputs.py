@@ -41,7 +41,7 @@ class FrameOutputs:
 def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
     """Run `network` on up to `limit` evenly spaced frames.
 
-    By OpenVINO in the engine's precision if it is installed, else by torch in float32.
+    OpenVINO computes in the engine's precision if it is installed, else torch in float32.
     """
     chosen = np.linspace(0, len(frames) - 1, min(limit, len(frames))).astype(np.int64)
     run = _run_openvino if has_openvino() else _run_torch
@@ -74,7 +74,7 @@ def _run_openvino(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Outputs of the network (N, 9), inputs of the head (N, F) and textures (N, T).
 
-    With one request per core; three times as fast as torch in float32.
+    Computed with one request per core, which is three times as fast as torch in float32.
     """
     x = np.empty((len(chosen), network.architecture.uncertainty_inputs), np.float32)
     outputs = np.empty((len(chosen), OUTPUTS), np.float32)

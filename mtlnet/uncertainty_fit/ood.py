@@ -207,7 +207,7 @@ def minimise(
 ) -> None:
     """Minimise `loss(rows)` over random batches of rows of `count` samples.
 
-    By AdamW, with a learning rate that falls to 0 along a cosine.
+    Uses AdamW with a learning rate that falls to 0 along a cosine.
     """
     optimizer = torch.optim.AdamW(
         parameters, settings.learning_rate, weight_decay=settings.weight_decay

@@ -45,7 +45,7 @@ class BodyBudget:
         self._own[BODY_BYTES] = self.held
 
     def _excess(self, size: int) -> float:
-        """By how many bytes `size` more bytes would exceed the budget."""
+        """Number of bytes by which `size` more bytes would exceed the budget."""
         others = sum(cells[BODY_BYTES] for cells in self._others)
         return self.held + size + others - self._limit
 

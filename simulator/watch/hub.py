@@ -25,7 +25,7 @@ class Snapshot:
     """The constant data of one road, as JSON."""
     state: str
     pictures: dict[str, tuple[int, bytes]]
-    """By view: the number of the state it shows, and the JPEG."""
+    """For each view by name: the number of the state that the image shows, and the JPEG."""
 
 
 @dataclass(eq=False)

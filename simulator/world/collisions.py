@@ -1,7 +1,7 @@
 """Physics steps with contacts: PyBullet moves the ego car, wrecks and nearby traffic.
 
-Used while the ego car touches something or a wreck is moving; otherwise the compiled code of
-`free_motion` moves the ego car. A traffic car that is hit becomes a wreck: it leaves traffic and
+This code runs while the ego car touches something or a wreck is moving; otherwise the compiled code
+of `free_motion` moves the ego car. A traffic car that is hit becomes a wreck: it leaves traffic and
 moves as a rigid body. PyBullet is imported at the first contact of the process. World frame, SI
 units.
 """

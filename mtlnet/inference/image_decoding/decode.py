@@ -1,10 +1,11 @@
 """Decodes image files to the model's input: limits, header, strict decoding, scaling.
 
-Used by `mtlnet predict`, `train`, `evaluate` and `serve`, so that all get the same pixels. The size
-is read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is rotated
-upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop refers to the upright image.
-A wider image is cropped to the model's field of view (`mtlnet.inference.image_decoding.crop`).
-Alpha is dropped, grey becomes RGB, 16 bits are reduced to 8.
+`mtlnet predict`, `train`, `evaluate` and `serve` use this module, so that all get the same pixels.
+The size is read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is
+rotated upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop refers to the
+upright image. A wider image is cropped to the model's field of view
+(`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, 16 bits are reduced to
+8.
 
 A service accepts JPEG and PNG (`inspect`, `decode`). A file on this machine may be of another kind
 and is limited only by memory (`read_image`, `read_whole_image`, `decode_file`).

@@ -54,6 +54,7 @@ def bins_loss(
 
 
 def mean_error(scores: Tensor, targets: Tensor) -> Tensor:
-    """Huber loss, in bins, of the means of B distributions: scores and targets (B, bins)."""
+    """Huber loss, in bins, of the difference between the means of B predicted distributions
+    (`scores` before softmax) and B target distributions, both (B, bins)."""
     number = torch.arange(scores.shape[1], dtype=torch.float32, device=scores.device)
     return smooth_l1_loss(torch.softmax(scores, 1) @ number, targets @ number)
