@@ -21,6 +21,7 @@ from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
 from mtlnet.sources.read import READ_AHEAD, SourceImage, read_sources
 from mtlnet.sources.streams import Stream
+from runtime.cli import counted
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000
@@ -136,7 +137,7 @@ class _Answers:
         """All answers. Raises InputsLeftOut."""
         if not self._unusable:
             return self._results
-        others = f"; {self.used} others were done" if self.used else ""
+        others = f"; {counted(self.used, 'image')} done" if self.used else ""
         raise InputsLeftOut(f"{first_of(self._unusable)}{others}", self._results)
 
 

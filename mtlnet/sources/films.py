@@ -104,14 +104,15 @@ class Film:
             stated = int(film.get(cv2.CAP_PROP_FRAME_COUNT))
             share = f"{used} of {stated}" if stated > used else f"{used}"
             return (
-                f"{self.path} ends after {share} frames; those were used (it breaks off: {reason})"
+                f"{self.path} ends after {share} frames; these frames were used "
+                f"(it breaks off: {reason})"
             )
         lost = max(lost, stated_frames(self.path, int(film.get(cv2.CAP_PROP_FRAME_COUNT))) - used)
         if damaged_at < 0 and not lost:
             return ""
         told = f" ({errors.first})" if errors.first else ""
         near = f" near frame {damaged_at}" if damaged_at >= 0 else ""
-        missing = f"{lost} could not be" if lost else "those after it may be wrong"
+        missing = f"{lost} could not be" if lost else "frames after it may be wrong"
         return f"{self.path} is damaged{near}{told}: {used} frames were used, {missing}"
 
 

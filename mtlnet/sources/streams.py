@@ -99,12 +99,12 @@ class Stream:
         if waited_s > 0.9 * STALL_S:
             self.fault = (
                 f"{self.name} sent nothing for {waited_s:.0f} s after {number} pictures{told}; "
-                "those were used: check camera and network"
+                "these pictures were used: check camera and network"
             )
         elif told or not number:
             self.fault = (
-                f"{self.name} broke off after {number} pictures{told}; those were used: check "
-                "camera and network"
+                f"{self.name} broke off after {number} pictures{told}; these pictures were used: "
+                "check camera and network"
             )
         elif self.damaged:
             self.fault = (

@@ -122,7 +122,7 @@ def test_images_beside_one_that_cannot_be_used_are_answered(
     assert done.returncode == 1
     line = error_line(done)
     assert "bad.jpg: no image file" in line
-    assert line.endswith("(and 1 more); 1 others were done")
+    assert line.endswith("(and 1 more); 1 image done")
     (row,) = json.loads(done.stdout)
     assert row["image"] == str(good)
     assert [line.partition(",")[0] for line in table.read_text().splitlines()] == [

@@ -87,5 +87,5 @@ class CodedFilm:
             told = f" ({errors.first})" if errors.first else ""
             self.fault = (
                 f"{self._name}: {len(self._times) - used} of {len(self._times)} pictures cannot be "
-                f"decoded{told}; the others were used"
+                f"decoded{told}; all other pictures were used"
             )

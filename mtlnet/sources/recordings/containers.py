@@ -98,7 +98,9 @@ class McapFiles:
         used = 0
         for file in self._files:
             if not file.is_file():
-                self.fault = f"{self._path}: its file {file.name} is missing; the others were used"
+                self.fault = (
+                    f"{self._path}: its file {file.name} is missing; all other files were used"
+                )
                 continue
             try:
                 for time, data in self._messages_of(file, topic):
@@ -107,8 +109,8 @@ class McapFiles:
             except DAMAGE as error:
                 reason = " ".join(str(error).split()) or type(error).__name__
                 self.fault = (
-                    f"{file} is cut or damaged after {used} pictures of {topic}; those were used "
-                    f"({reason})"
+                    f"{file} is cut or damaged after {used} pictures of {topic}; these pictures "
+                    f"were used ({reason})"
                 )
 
     def _topics_of(self, file: Path) -> list[Topic]:
@@ -196,8 +198,8 @@ class RosBag:
                     return
                 except _bag_errors() as error:
                     self.fault = (
-                        f"{self._path} is cut or damaged after {used} pictures of {topic}; those "
-                        f"were used ({error})"
+                        f"{self._path} is cut or damaged after {used} pictures of {topic}; these "
+                        f"pictures were used ({error})"
                     )
                     return
                 yield time, data

@@ -42,8 +42,8 @@ class CutDatabase:
                 yield time, data
                 used += 1
         self.fault = (
-            f"{self._path} is cut or damaged after {used} pictures of {topic}; those were used "
-            f"({self._reason})"
+            f"{self._path} is cut or damaged after {used} pictures of {topic}; these pictures "
+            f"were used ({self._reason})"
         )
 
     def _open(self) -> sqlite3.Connection:

@@ -84,9 +84,9 @@ class Recording:
                 "taken: give --camera"
             )
         return camera, (
-            f"{self.path}: matrix and distortion are those of {topic.name}, the mount is the "
+            f"{self.path}: matrix and distortion come from {topic.name}, the mount is the "
             f"model's ({camera.height_above_road_m:g} m above the road, pitch "
-            f"{camera.pitch_deg:g} degrees); --camera takes others"
+            f"{camera.pitch_deg:g} degrees); --camera gives another camera"
         )
 
     def _reader(self) -> Callable[[bytes], Any]:

@@ -28,7 +28,7 @@ def test_a_cut_film_keeps_what_was_read(engine: BrightnessEngine, tmp_path: Path
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     table = tmp_path / "rows.jsonl"
     with pytest.raises(
-        UserError, match=r"cut\.avi ends after \d of 10 frames; those were used .it breaks"
+        UserError, match=r"cut\.avi ends after \d of 10 frames; these frames were used .it breaks"
     ):
         predict_files(engine, [str(cut)], [table])
     rows = table.read_text().splitlines()
@@ -51,7 +51,7 @@ def test_a_damaged_image_does_not_stop_the_others(engine: BrightnessEngine, tmp_
     (tmp_path / "b.jpg").write_text("no image")
     write_jpeg(tmp_path / "c.jpg", 200)
     table = tmp_path / "rows.csv"
-    with pytest.raises(UserError, match=r"b\.jpg: no image file.*; 2 others were done"):
+    with pytest.raises(UserError, match=r"b\.jpg: no image file.*; 2 images done"):
         predict_files(engine, [str(tmp_path)], [table])
     assert [line.split(",")[0][-5:] for line in table.read_text().splitlines()[1:]] == [
         "a.jpg",
@@ -97,7 +97,7 @@ def test_a_damaged_chunk_of_a_round_costs_its_frames_only(
     bad.write_bytes(content)
     table = tmp_path / "rows.jsonl"
     message = rf"image 0 of .*{bad.name} cannot be read: the chunk at byte \d+ is damaged"
-    with pytest.raises(UserError, match=rf"{message}.*and 23 more\); 24 others were done"):
+    with pytest.raises(UserError, match=rf"{message}.*and 23 more\); 24 images done"):
         predict_files(engine, [str(bad), str(good)], [table])
     rows = [json.loads(line) for line in table.read_text().splitlines()]
     assert [row["image"] for row in rows] == [f"{good}#{n}" for n in range(24)]

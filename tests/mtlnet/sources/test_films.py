@@ -95,7 +95,11 @@ def test_frames_of_varying_duration_are_all_that_there_are(make: Make) -> None:
     [
         ([*H264, "-movflags", "faststart"], "a.mp4", r"ends after \d+ of 20 frames.*'mdat' ends"),
         ([*H264, "-movflags", "frag_keyframe+empty_moov", "-g", "5"], "f.mp4", "ends after"),
-        ([*H264], "a.mkv", r"ends after \d+ of 20 frames; those were used .it breaks off: it sta"),
+        (
+            [*H264],
+            "a.mkv",
+            r"ends after \d+ of 20 frames; these frames were used .it breaks off: it sta",
+        ),
         (["-c:v", "mjpeg"], "a.avi", r"ends after \d+ of 20 frames"),
         (["-c:v", "wmv2"], "a.wmv", r"ends after \d+ frames.*bytes and has"),
         (["-c:v", "libtheora"], "a.ogv", r"its last page is missing"),

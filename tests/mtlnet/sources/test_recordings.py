@@ -271,7 +271,7 @@ def test_the_command_takes_a_topic_and_tells_of_the_camera(tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
     (row,) = json.loads(done.stdout)
     assert (row["image"], row["time_s"]) == (f"{bag}#0", START_S)
-    assert f"{bag}: matrix and distortion are those of /left/camera_info" in done.stderr
+    assert f"{bag}: matrix and distortion come from /left/camera_info" in done.stderr
     done = typed("mtlnet", "predict", bag)
     assert done.returncode == 1
     assert done.stderr.strip().splitlines()[-1].startswith(f"error: {bag} has several topics")

@@ -85,7 +85,7 @@ def test_a_stream_is_answered_to_its_end(
 @pytest.mark.parametrize(
     ("mode", "message"),
     [
-        ("stall", r"sent nothing for 1 s after 5 pictures; those were used"),
+        ("stall", r"sent nothing for 1 s after 5 pictures; these pictures were used"),
         ("cut", r"ended after 6 pictures; 1 came damaged and may be wrong \(.+\)"),
         ("smaller", r"picture 5 is 280 x 210 px, those before it are 560 x 420 px and were used"),
     ],
