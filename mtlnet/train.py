@@ -116,8 +116,8 @@ def train(
     *,
     checked: bool = False,
 ) -> ModelCard:
-    """Train by `config` and publish the model in `config.out`; takes the arguments of
-    `run_training`."""
+    """Train a network with the settings of `config` and publish the model in `config.out`. The
+    arguments are the same as those of `run_training`."""
     run_training(config, resumed, finish, report, checked=checked)
     return read_card(config.out)
 

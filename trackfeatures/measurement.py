@@ -117,8 +117,8 @@ def measure_pose(
 def in_lane_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float, float] | tuple[None, None]:
-    """`ml` and `mr` (m), or None twice if the in-lane system is inactive. The simulator compiles
-    this function and the next one."""
+    """`ml` and `mr` (m), or (None, None) if the in-lane system is inactive. The simulator
+    compiles this function and `on_marking_distances`."""
     lane = lane_index(to_middle, lanes, lane_width_m)
     beside = to_middle - lane_centre(lane, lanes, lane_width_m)
     ml = beside - lane_width_m / 2 - offsets[lane][RIGHT_LANE]

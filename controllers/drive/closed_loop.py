@@ -195,7 +195,8 @@ def check_reward(name: str) -> None:
 
 
 def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:
-    """Throttle and brake: `throttle` and 0 on a free road, less or braking behind a slower car."""
+    """Throttle and brake, each 0 to 1. On a free road the car keeps `throttle`; behind a slower car
+    the throttle is reduced or the car brakes."""
     leader = traffic.leader(now.s, now.to_middle) if traffic.count else None
     if leader is None:
         return throttle, 0.0

@@ -160,10 +160,10 @@ def regulate_smoothly(
 
 
 def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:
-    """The gain K (5,) of change = -K (e1, e1', e2, e2', wheel angle), all minus their set points.
+    """The gain K (5,) of the law change = -K x.
 
-    The change, in rad, is the change of the wheel angle over one control step of `dt` s at `speed`
-    m/s.
+    x is (e1, e1', e2, e2', wheel angle) minus the set points of these five. The change, in rad, is
+    the change of the wheel angle over one control step of `dt` s at `speed` m/s.
     """
     A, B = CAR.discretise(speed, dt)
     states = np.block([[A, B], [np.zeros((1, 4)), np.eye(1)]])

@@ -56,9 +56,10 @@ def evaluate_protocol(
 ) -> dict[str, Any]:
     """The report on the held-out rounds; its entry `protocol` has the rows of the paper's table.
 
-    A row is a drive, a part of one or the held-out rounds; its `paper` has the paper's figures.
-    `every`: evaluate every n-th frame only. Raises UserError for another protocol and for data
-    without these rounds, ModelError for a model that was trained on them or on dirt-3.
+    A row is a drive, a part of a drive, or all held-out rounds that are no drive; its `paper` has
+    the paper's figures. `every`: evaluate every n-th frame only. Raises UserError for another
+    protocol and for data without these rounds, ModelError for a model that was trained on them or
+    on dirt-3.
     """
     if protocol != PAPER:
         raise UserError(f"there is no protocol {protocol!r}; give {PAPER}")

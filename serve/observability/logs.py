@@ -119,7 +119,8 @@ def _log_native_lines(reader: int) -> None:
 
 
 class RefusalLog:
-    """Logs refused requests, limited by a token bucket and for each client."""
+    """Logs refused requests. A token bucket limits the lines of all clients, a second limit the
+    lines of each client's network."""
 
     def __init__(self, workers: int = 1) -> None:
         self._rate = REFUSALS_PER_S / workers

@@ -35,7 +35,8 @@ def check_controls(controls: str) -> None:
 
 
 def action_space(controls: Controls) -> gym.spaces.Box:
-    """(1,) steering, or (4,) steering, throttle, brake and gear; float32."""
+    """The space of actions, float32: shape (1,) for steering, or (4,) for steering, throttle, brake
+    and gear."""
     low, high = zip(*(LIMITS[name] for name in NAMES[controls]), strict=True)
     return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 

@@ -17,7 +17,8 @@ class Score:
         self.ended: Ending | None = None
 
     def count(self, world: World) -> float:
-        """Count the state that `world` is in, once; returns the simulated seconds it took."""
+        """Add the present state of `world` to the score, once per state. Returns the simulated
+        seconds since the state that was added before."""
         now = world.state
         passed = now.time_s - self._time
         if passed < 0.0:
