@@ -77,7 +77,7 @@ def test_one_input_that_cannot_be_read_costs_no_other(
     given.append(str(sorted((tmp_path / "other" / "rounds").glob("*.mcap"))[0]))
     table = tmp_path / "rows.csv"
     notes: list[str] = []
-    with pytest.raises(UserError, match=r"cut\.mcap is damaged .* \(and 7 more\); 1 others were"):
+    with pytest.raises(UserError, match=r"cut\.mcap is damaged .* \(and 7 more\); 1 image done"):
         predict_files(engine, given, [table], note=notes.append)
     with table.open(newline="") as file:
         assert [row["image"] for row in csv.DictReader(file)] == [str(good)]
