@@ -41,7 +41,7 @@ def test_a_film_that_cannot_be_opened_loses_no_other_file(
     broken, table = tmp_path / "broken.mp4", tmp_path / "rows.jsonl"
     broken.write_bytes(b"no film")
     film = write_film(tmp_path / "film.mp4", [10, 200])
-    with pytest.raises(UserError, match=r"broken.mp4 cannot be opened as a film.*2 others"):
+    with pytest.raises(UserError, match=r"broken.mp4 cannot be opened as a film.*2 images done"):
         predict_files(engine, [str(broken), str(film)], [table])
     assert len(table.read_text().splitlines()) == 2
 
