@@ -17,11 +17,13 @@ from datagen.recording.splits import Split, split_path, write_split
 from mtlnet.architecture import ARCHITECTURES, GRID, HEIGHT, MTL, WIDTH, Conv
 from mtlnet.data.description import describe_data
 from mtlnet.export.publish import Provenance, publish
+from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.config import TrainConfig
 from mtlnet.uncertainty_fit import ood
 from mtlnet.uncertainty_fit.head import fit_uncertainty_head
+from tests.mtlnet.predict.brightness_engine import BrightnessEngine
 from trackfeatures.camera import CameraParameters
 
 FRAMES = 24
@@ -134,6 +136,12 @@ def published(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     provenance = Provenance(data=describe_data(data, frames))
     publish(network, run, images, provenance, uncertainty)
     return run
+
+
+@pytest.fixture
+def engine() -> BrightnessEngine:
+    """The engine of the tests of `mtlnet predict`."""
+    return BrightnessEngine(read_card(resolve_run("default")))
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The networks other than the paper's: layers, folding, exported graphs, training."""
+"""All networks: folding, exported graphs, training; layers of those other than the paper's."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +10,10 @@ import torch
 from datagen.recording import Dataset
 from mtlnet.architecture import ARCHITECTURES, Architecture, find_architecture, with_heads
 from mtlnet.data.loader import Loader
+from mtlnet.data.road_ahead import RoadAhead
 from mtlnet.inference.engine import EngineKind, load_engine, openvino_core
 from mtlnet.inference.model_card import read_card
+from mtlnet.model.auxiliary import LABELS
 from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
 from mtlnet.model.openvino_graph import TOLERANCE, build_graph
 from mtlnet.train import start_training
@@ -27,8 +29,8 @@ KINDS: tuple[EngineKind, EngineKind] = ("openvino", "torch")
 OTHERS = [*BACKBONES, "deepdriving", "grid", "grid_residual", "grid-coded", "mtl-bins"]
 
 
-def build(name: str, *, batch_norm: bool = False, seed: int = 1) -> Network:
-    network = Network(architecture=thin(name), batch_norm=batch_norm)
+def build(name: str, *, batch_norm: bool = False, dropout: float = 0.0, seed: int = 1) -> Network:
+    network = Network(architecture=thin(name), batch_norm=batch_norm, dropout=dropout)
     initialise(network, seed)
     with torch.no_grad():  # heads as large as trained ones, so that outputs depend on the features
         network.get_parameter("heads.distance.weight").mul_(10)
@@ -71,14 +73,15 @@ def test_deepdriving_gives_equal_class_probabilities() -> None:
         TrainConfig(Path("data"), Path("out"), network="vgg")
 
 
-@pytest.mark.parametrize("name", BACKBONES)
-def test_folding_a_backbone_keeps_its_outputs(name: str) -> None:
-    network = build(name, batch_norm=True).train()
+@pytest.mark.parametrize("name", ["mtl", *BACKBONES])
+def test_folding_keeps_the_outputs(name: str) -> None:
+    network = build(name, batch_norm=True, dropout=0.1).train()
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         network(torch.from_numpy(images(4)))  # updates the running statistics
         for module in network.modules():
             if isinstance(module, torch.nn.BatchNorm2d):
+                module.weight.uniform_(0.5, 1.5, generator=generator)
                 module.bias.uniform_(-0.2, 0.2, generator=generator)
     network.target_mean.copy_(torch.linspace(0.2, 0.7, 6))
     network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
@@ -104,16 +107,22 @@ def test_the_openvino_graph_matches_torch(name: str) -> None:
     np.testing.assert_allclose(several(frames)[0], expected, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("name", ["mobilenet_v3_small", "deepdriving"])
-def test_other_networks_overfit_a_batch(dataset: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "steps"), [("mobilenet_v3_small", 12), ("deepdriving", 12), ("grid", 40)]
+)
+def test_other_networks_overfit_a_batch(dataset: Path, name: str, steps: int) -> None:
     architecture = thin(name)
-    loader = Loader(Dataset.open(dataset).select("train"), CameraParameters(), 4, 0, augment=False)
+    frames, camera = Dataset.open(dataset).select("train"), CameraParameters()
+    ahead = RoadAhead(frames, camera) if architecture.bins else None
+    loader = Loader(frames, camera, 4, 0, augment=False, ahead=ahead)
     recipe = replace(RECIPES["fast"], augment=False)
     trainer = Trainer(recipe, architecture.default_alpha, 0, torch.device("cpu"), architecture)
     trainer.standardise(loader)
     batch = loader.make(0)
-    totals = [float(trainer.step(batch, 0.05).total.detach()) for _ in range(12)]
-    assert totals[-1] < 0.5 * totals[0]
+    assert batch.ahead.shape == (4, LABELS if architecture.bins else 0)
+    losses = [trainer.step(batch, 0.05) for _ in range(steps)]
+    assert losses[-1].total.item() < 0.5 * losses[0].total.item()
+    assert losses[-1].distance.item() < 0.3 * losses[0].distance.item()
 
 
 def test_another_network_is_trained_published_and_run(dataset: Path, tmp_path: Path) -> None:

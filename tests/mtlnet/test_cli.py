@@ -97,20 +97,6 @@ def test_train_evaluate_and_predict(dataset: Path, tmp_path: Path) -> None:
     assert f"{run} already exists" in again
 
 
-def test_files_that_are_no_images_are_refused(published: Path, tmp_path: Path) -> None:
-    text, cut, narrow = (tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg"))
-    text.write_text("not an image at all")
-    cut.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 280, 3), np.uint8))[:20])
-    narrow.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 100, 3), np.uint8)))
-    for path, seen in [
-        (tmp_path / "none.jpg", "there is no image file"),
-        (text, "a.jpg: no image file"),
-        (cut, "b.jpg: the JPEG cannot be decoded"),
-        (narrow, "c.jpg: the image is 100 x 210 px"),
-    ]:
-        assert seen in refused("predict", "--model", published, path)
-
-
 def test_images_beside_one_that_cannot_be_used_are_answered(
     published: Path, tmp_path: Path
 ) -> None:

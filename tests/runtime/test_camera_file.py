@@ -131,6 +131,17 @@ def test_what_is_chosen_or_assumed_is_said(tmp_path: Path) -> None:
         ("width: 640\nheight: 360\nmatrix: [700, 0, 640, 360]\n", "singular"),
         ("distortion: fisheye\ncoefficients: [1, 2]\n", "has 2 numbers; give 4"),
         ("distortion: [1]\n", "distortion is \\[1\\]; give one of none"),
+        ("", "describes no camera"),
+        ("- 3", "describes no camera"),
+        ("fov_y_deg: [", "cannot be read as a camera"),
+        ("fov: 60", "key 'fov' is unknown; known keys are width"),
+        ("fov_y_deg: wide", "fov_y_deg is 'wide'; give a number"),
+        ("fov_y_deg: 170", "vertical field of view 170 deg"),
+        ("z: 1.0\nheight_above_road_m: 1.2", "has both z and height_above_road_m"),
+        ("height_above_road_m: 0", "is impossible; give size and height above 0"),
+        ("z: .nan", "is impossible"),
+        ("x: .inf", "is impossible"),
+        ("pitch_deg: 40", "pitch_deg is 40; give -30 to 30"),
         ("height_std: 2\n", "height_std is 2"),
         ("yaw_deg: 200\n", "yaw_deg is 200; give -180 to 180"),
         ("roll_deg: .nan\n", "roll_deg is nan"),
@@ -150,3 +161,5 @@ def test_no_text_at_all_is_a_clear_line(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe\x00width")
     with pytest.raises(UserError, match="cannot be read as a camera"):
         read_camera(path, MODEL)
+    with pytest.raises(UserError, match=r"none.yaml cannot be read as a camera: No such file"):
+        read_camera(tmp_path / "none.yaml", MODEL)

@@ -18,10 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import pytest
-import simplejpeg
 from numpy.typing import NDArray
 
 import trackfeatures as tf
@@ -39,6 +37,9 @@ from serve.server import guard
 from serve.server.connection import GuardedProtocol
 from serve.server.worker_server import WorkerServer
 from serve.shared_memory import HEARTBEAT, SharedMemory, WorkerPeers
+from tests.mtlnet.inference.images import jpeg as jpeg
+from tests.mtlnet.inference.images import picture as picture
+from tests.mtlnet.inference.images import png as png
 from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
@@ -88,25 +89,6 @@ def outputs(
     """Engine outputs (9,) for these distances (m, NaN if absent) and this angle (rad)."""
     coded = tf.encode(np.array([distances]), np.array([angle]))[0]
     return np.concatenate([coded, [0.2, 0.5, 0.3]]).astype(np.float32)
-
-
-def picture(width: int = 280, height: int = 210, channels: int = 3) -> NDArray[np.uint8]:
-    """A smooth image (height, width, channels) uint8 with a gradient in each channel."""
-    x, y = np.meshgrid(np.linspace(0, 200, width), np.linspace(0, 50, height))
-    planes = [(x + y * (1 + c)) % 256 for c in range(channels)]
-    return np.stack(planes, axis=2).astype(np.uint8)
-
-
-def jpeg(image: NDArray[np.uint8], colours: str = "RGB") -> bytes:
-    subsampling = "444" if colours == "RGB" else "Gray"
-    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), 95, colours, subsampling))
-
-
-def png(image: NDArray[Any], *options: int) -> bytes:
-    """A PNG file of `image`, which has OpenCV's channel order (BGR, BGRA or grey)."""
-    done, data = cv2.imencode(".png", image, list(options))
-    assert done
-    return data.tobytes()
 
 
 JPEG, PNG = jpeg(picture()), png(picture())

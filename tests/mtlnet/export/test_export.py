@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import load_file
 
 import mtlnet.export.convert
@@ -17,7 +16,7 @@ import mtlnet.export.int8
 from datagen.recording import Dataset, Frames
 from mtlnet.data.rounds import select_rounds
 from mtlnet.evaluation.tables import export_lines
-from mtlnet.export.convert import export_model, write_openvino
+from mtlnet.export.convert import ONNX_FILE, export_model, write_openvino
 from mtlnet.export.int8 import (
     choose_float_activations,
     convolutions_by_work,
@@ -45,7 +44,7 @@ from mtlnet.inference.model_card import (
 )
 from mtlnet.inference.torch_engine import convert_run, load_served
 from mtlnet.inference.trained_rounds import names_entry
-from mtlnet.model.network import Network, fold, load_network
+from mtlnet.model.network import Network, fold
 from mtlnet.model.openvino_graph import TOLERANCE, build_graph, write_graph
 from mtlnet.train import train
 from mtlnet.training.config import TrainConfig
@@ -96,13 +95,22 @@ def test_the_gate_fails_beyond_its_limits(changes: dict[str, Any], failed: list[
     assert "r" not in found["worse"]  # without labels
 
 
-def test_openvino_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path: Path) -> None:
-    exact = export_model(trained, "openvino", "f32", dataset, tmp_path / "f32", frames=4)
-    half = export_model(trained, "openvino", "bf16", dataset, tmp_path / "bf16", frames=4)
+@pytest.mark.parametrize(
+    ("kind", "weights"),
+    [
+        ("openvino", GRAPH_WEIGHTS),
+        pytest.param("onnx", ONNX_FILE, marks=[pytest.mark.extended, pytest.mark.slow]),
+    ],
+)
+def test_bf16_halves_the_weights(
+    trained: Path, dataset: Path, tmp_path: Path, kind: str, weights: str
+) -> None:
+    exact = export_model(trained, kind, "f32", dataset, tmp_path / "f32", frames=4)
+    half = export_model(trained, kind, "bf16", dataset, tmp_path / "bf16", frames=4)
     assert exact["check"]["largest"] < TOLERANCE
     # bf16 keeps 8 bits: a relative 0.004 of each weight.
     assert TOLERANCE / 10 < half["check"]["largest"] < 0.05
-    sizes = [(tmp_path / p / GRAPH_WEIGHTS).stat().st_size for p in ("f32", "bf16")]
+    sizes = [(tmp_path / p / weights).stat().st_size for p in ("f32", "bf16")]
     assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
     assert json.loads((tmp_path / "bf16" / EXPORT_FILE).read_text())["check"] == half["check"]
 
@@ -138,17 +146,6 @@ def test_the_served_graph_is_one_of_one_image() -> None:
     """A graph for any number of images is slower for one."""
     run = resolve_run("default")
     assert list(read_graph(run, read_card(run)).input(0).shape) == [1, 210, 280, 3]
-
-
-@pytest.mark.extended
-@pytest.mark.slow
-def test_onnx_bf16_halves_the_weights(trained: Path, dataset: Path, tmp_path: Path) -> None:
-    exact = export_model(trained, "onnx", "f32", dataset, tmp_path / "f32", frames=4)
-    half = export_model(trained, "onnx", "bf16", dataset, tmp_path / "bf16", frames=4)
-    assert exact["check"]["largest"] < TOLERANCE
-    assert TOLERANCE / 10 < half["check"]["largest"] < 0.05
-    sizes = [(tmp_path / p / "model.onnx").stat().st_size for p in ("f32", "bf16")]
-    assert sizes[1] / sizes[0] == pytest.approx(0.5, abs=0.01)
 
 
 def consumers(operation: Any) -> Any:
@@ -307,13 +304,6 @@ def test_unsupported_exports_are_refused(trained: Path, dataset: Path, tmp_path:
     (tmp_path / "labels.csv").touch()
     with pytest.raises(UserError, match=r"labels.csv; an export is checked on recorded rounds"):
         export_model(trained, "onnx", "f32", tmp_path)
-
-
-def test_a_published_network_is_the_papers(trained: Path) -> None:
-    # The run was trained with batch normalisation, which was folded.
-    network = load_network(trained / WEIGHTS)
-    assert sum(p.numel() for p in network.parameters()) == 9_259_913
-    assert not [m for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
 
 
 def test_printed_lines_of_the_export_command() -> None:

@@ -14,7 +14,7 @@ from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.export.convert import write_export
 from mtlnet.export.int8 import gate
 from mtlnet.export.ship import half, ship_model, write_page
-from mtlnet.inference.engine import INT8, EngineKind, load_engine
+from mtlnet.inference.engine import INT8, load_engine
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
@@ -127,20 +127,6 @@ def test_rounds_on_which_no_standard_deviations_are_fitted(
     with pytest.raises(ModelError, match=r"z 1\.4 instead of 0\.95"):
         ship_model(published, tmp_path / "other", high)
     assert not list(tmp_path.glob("*/model.safetensors"))
-
-
-@pytest.mark.parametrize("kind", ["openvino", "torch"])
-def test_damage_is_found(shipped: Path, tmp_path: Path, kind: EngineKind) -> None:
-    broken, name = tmp_path / "broken", GRAPH_WEIGHTS if kind == "openvino" else WEIGHTS
-    shutil.copytree(shipped, broken)
-    content = bytearray((broken / name).read_bytes())
-    content[-1] ^= 1
-    (broken / name).write_bytes(content)
-    with pytest.raises(ModelError, match=f"{name} is damaged: its SHA-256"):
-        load_engine(broken, kind)
-    (broken / name).unlink()
-    with pytest.raises(ModelError, match=f"{name} is missing"):
-        load_engine(broken, kind)
 
 
 def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference import model_card
-from mtlnet.inference.engine import load_engine
+from mtlnet.inference.engine import EngineKind, load_engine
 from mtlnet.inference.model_card import ModelError, read_card, resolve_run
 from mtlnet.inference.prediction import OUTPUTS, decode_outputs
 from tests.mtlnet.conftest import draw_road, require_close
@@ -63,16 +63,22 @@ def test_images_of_another_size_or_type_are_refused(published: Path) -> None:
                 engine(image)
 
 
-def test_damaged_files_are_refused(copy: Path) -> None:
-    content = bytearray((copy / "model.bin").read_bytes())
-    content[1000] ^= 1
-    (copy / "model.bin").write_bytes(content)
-    with pytest.raises(ModelError, match=r"model\.bin is damaged"):
-        load_engine(copy)
-    (copy / "model.bin").unlink()
-    with pytest.raises(ModelError, match=r"model\.bin is missing"):
-        load_engine(copy)
-    load_engine(copy, "torch")
+@pytest.mark.parametrize(
+    ("kind", "other", "name"),
+    [("openvino", "torch", "model.bin"), ("torch", "openvino", "model.safetensors")],
+)
+def test_damaged_files_are_refused(
+    copy: Path, kind: EngineKind, other: EngineKind, name: str
+) -> None:
+    content = bytearray((copy / name).read_bytes())
+    content[-1] ^= 1
+    (copy / name).write_bytes(content)
+    with pytest.raises(ModelError, match=f"{name} is damaged: its SHA-256"):
+        load_engine(copy, kind)
+    (copy / name).unlink()
+    with pytest.raises(ModelError, match=f"{name} is missing"):
+        load_engine(copy, kind)
+    load_engine(copy, other)
     (copy / "card.json").write_text("{")
     with pytest.raises(ModelError, match=r"card\.json is damaged"):
         load_engine(copy)

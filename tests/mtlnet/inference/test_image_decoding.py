@@ -2,40 +2,20 @@
 
 import struct
 import zlib
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import simplejpeg
-from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding.crop import Box, crop_box
 from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode, inspect
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import read_head, read_structure
+from tests.mtlnet.inference.images import chunk, jpeg, picture, png
 from trackfeatures.camera import CameraParameters
 
 VIEW = CameraParameters()
-
-
-def picture(width: int = 280, height: int = 210, channels: int = 3) -> NDArray[np.uint8]:
-    """A smooth image (height, width, channels): a gradient in each channel."""
-    x, y = np.meshgrid(np.linspace(0, 200, width), np.linspace(0, 50, height))
-    planes = [(x + y * (1 + c)) % 256 for c in range(channels)]
-    return np.stack(planes, axis=2).astype(np.uint8)
-
-
-def jpeg(image: NDArray[np.uint8], colours: str = "RGB") -> bytes:
-    subsampling = "444" if colours == "RGB" else "Gray"
-    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), 95, colours, subsampling))
-
-
-def png(image: NDArray[Any]) -> bytes:
-    """`image` in OpenCV's channel order (BGR, BGRA or grey)."""
-    done, data = cv2.imencode(".png", image)
-    assert done
-    return data.tobytes()
 
 
 def pixels(body: bytes) -> np.ndarray:
@@ -46,10 +26,6 @@ def refusal(body: bytes) -> ImageError:
     with pytest.raises(ImageError) as caught:
         pixels(body)
     return caught.value
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 def handmade_png(

@@ -2,7 +2,6 @@
 are numpy's, after the table of TIFF 6.0; ours are OpenCV's."""
 
 import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import simplejpeg
-from numpy.typing import NDArray
 
 from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.decode import (
@@ -23,10 +21,12 @@ from mtlnet.inference.image_decoding.decode import (
 )
 from mtlnet.inference.image_decoding.orientation import exif_orientation, read_tags
 from mtlnet.inference.rectification import Rectification
+from tests.mtlnet.inference.images import Pixels, exif, in_jpeg, in_png, segment
 from trackfeatures.camera import CameraParameters
 
 VIEW = CameraParameters()
-Pixels = NDArray[np.uint8]
+
+
 TURNS: dict[int, Callable[[Pixels], Pixels]] = {
     1: lambda image: image,
     2: lambda image: image[:, ::-1],
@@ -40,37 +40,6 @@ TURNS: dict[int, Callable[[Pixels], Pixels]] = {
 """Correction of the stored image, by orientation."""
 BACK = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 ALL = range(1, 9)
-
-
-def exif(orientation: int, order: str = ">", kind: int = 3, count: int = 1) -> bytes:
-    """An Exif block with a maker tag before the orientation, and another orientation in the
-    thumbnail's directory."""
-    mark = b"MM" if order == ">" else b"II"
-    value = struct.pack(order + ("I" if kind == 4 else "HH"), *([orientation] + [0] * (kind != 4)))
-    maker = struct.pack(order + "HHI4s", 0x010F, 2, 4, b"Cam\0")
-    entry = struct.pack(order + "HHI", 0x0112, kind, count) + value
-    thumbnail = struct.pack(order + "HHHIHHI", 1, 0x0112, 3, 1, 5, 0, 0)
-    first = struct.pack(order + "H", 2) + maker + entry + struct.pack(order + "I", 38)
-    return mark + struct.pack(order + "HI", 42, 8) + first + thumbnail
-
-
-def segment(content: bytes, marker: int = 0xE1) -> bytes:
-    return bytes((0xFF, marker)) + struct.pack(">H", len(content) + 2) + content
-
-
-def in_jpeg(image: Pixels, block: bytes, *before: bytes) -> bytes:
-    body = bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), 95, "RGB", "444"))
-    return body[:2] + b"".join(before) + segment(b"Exif\0\0" + block) + body[2:]
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def in_png(image: Pixels, block: bytes, *, at_end: bool = False) -> bytes:
-    body = cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()
-    place = len(body) - 12 if at_end else 33
-    return body[:place] + chunk(b"eXIf", block) + body[place:]
 
 
 def by_opencv(suffix: str, image: Pixels, block: bytes) -> bytes:

@@ -6,57 +6,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from mtlnet.predict.run import predict_files
 from tests.mtlnet.conftest import write_dataset, write_round
-from tests.mtlnet.predict.brightness_engine import BrightnessEngine, write_film, write_jpeg
+from tests.mtlnet.predict.brightness_engine import BrightnessEngine, write_jpeg
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
-
-
-def test_a_cut_film_keeps_what_was_read(engine: BrightnessEngine, tmp_path: Path) -> None:
-    whole = tmp_path / "whole.avi"
-    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (560, 420))
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        writer.write(rng.integers(0, 256, (420, 560, 3), dtype=np.uint8))
-    writer.release()
-    cut = tmp_path / "cut.avi"
-    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    table = tmp_path / "rows.jsonl"
-    with pytest.raises(
-        UserError, match=r"cut\.avi ends after \d of 10 frames; these frames were used .it breaks"
-    ):
-        predict_files(engine, [str(cut)], [table])
-    rows = table.read_text().splitlines()
-    assert 2 <= len(rows) < 10
-
-
-def test_a_film_that_cannot_be_opened_loses_no_other_file(
-    engine: BrightnessEngine, tmp_path: Path
-) -> None:
-    broken, table = tmp_path / "broken.mp4", tmp_path / "rows.jsonl"
-    broken.write_bytes(b"no film")
-    film = write_film(tmp_path / "film.mp4", [10, 200])
-    with pytest.raises(UserError, match=r"broken.mp4 cannot be opened as a film.*2 images done"):
-        predict_files(engine, [str(broken), str(film)], [table])
-    assert len(table.read_text().splitlines()) == 2
-
-
-def test_a_damaged_image_does_not_stop_the_others(engine: BrightnessEngine, tmp_path: Path) -> None:
-    write_jpeg(tmp_path / "a.jpg", 10)
-    (tmp_path / "b.jpg").write_text("no image")
-    write_jpeg(tmp_path / "c.jpg", 200)
-    table = tmp_path / "rows.csv"
-    with pytest.raises(UserError, match=r"b\.jpg: no image file.*; 2 images done"):
-        predict_files(engine, [str(tmp_path)], [table])
-    assert [line.split(",")[0][-5:] for line in table.read_text().splitlines()[1:]] == [
-        "a.jpg",
-        "c.jpg",
-    ]
 
 
 def test_one_input_that_cannot_be_read_costs_no_other(

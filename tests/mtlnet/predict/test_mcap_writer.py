@@ -13,18 +13,12 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from datagen.recording.images import encode
-from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.run import predict_files
 from tests.mtlnet.predict.brightness_engine import BrightnessEngine, write_film, write_jpeg
 from trackfeatures.camera import CameraParameters
 
 EPOCH_NS = 1_577_836_800_000_000_000
-
-
-@pytest.fixture
-def engine() -> BrightnessEngine:
-    return BrightnessEngine(read_card(resolve_run("default")))
 
 
 def read(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -118,15 +112,3 @@ def test_its_pictures_are_those_of_the_given_cameras_place_and_are_read_again(
     assert shown is not None
     assert again["angle_rad"] == pytest.approx(shown.mean() / 255 - 0.5, abs=1e-4)
     assert not notes  # its camera is the model's
-
-
-def test_an_interrupted_file_is_complete(engine: BrightnessEngine, tmp_path: Path) -> None:
-    film, out = write_film(tmp_path / "in.mp4", [30] * 8), tmp_path / "out.mcap"
-
-    def interrupt(done: int, total: int) -> None:
-        if done == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        predict_files(engine, [str(film)], [out], report=interrupt)
-    assert len(read(out)["/features"]) == 4

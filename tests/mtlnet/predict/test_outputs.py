@@ -8,6 +8,7 @@ from unittest import mock
 
 import cv2
 import pytest
+from mcap.reader import make_reader
 
 import trackfeatures as tf
 from mtlnet.predict.run import predict_files
@@ -116,16 +117,20 @@ def test_nothing_is_written_after_an_error(engine: BrightnessEngine, tmp_path: P
     assert len(engine.seen) < 60
 
 
-def test_an_interrupted_film_is_playable(engine: BrightnessEngine, tmp_path: Path) -> None:
-    film, drawn = write_film(tmp_path / "in.mp4", [30] * 8), tmp_path / "out.mp4"
+def test_interrupted_files_are_complete(engine: BrightnessEngine, tmp_path: Path) -> None:
+    film = write_film(tmp_path / "in.mp4", [30] * 8)
+    drawn, recorded = tmp_path / "out.mp4", tmp_path / "out.mcap"
 
     def interrupt(done: int, total: int) -> None:
         if done == 5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        predict_files(engine, [str(film)], [drawn], report=interrupt)
+        predict_files(engine, [str(film)], [drawn, recorded], report=interrupt)
     assert cv2.VideoCapture(str(drawn)).get(cv2.CAP_PROP_FRAME_COUNT) == 4
+    with recorded.open("rb") as file:
+        messages = make_reader(file, validate_crcs=True).iter_messages(["/features"])
+        assert len(list(messages)) == 4
 
 
 @pytest.mark.parametrize(

@@ -94,19 +94,6 @@ def test_a_folder_gives_all_that_is_read_and_names_the_rest(
     assert [Path(row["image"]).name for row in matched] == [n for n in names if n.endswith("JPG")]
 
 
-def test_a_wider_lens_is_cropped_to_the_models_view(
-    engine: BrightnessEngine, tmp_path: Path
-) -> None:
-    image = np.zeros((420, 560, 3), np.uint8)
-    image[105:315, 140:420] = 255  # shown by half the tangent of the field of view
-    path = tmp_path / "wide.png"
-    cv2.imwrite(str(path), image)
-    camera: CameraParameters = engine.card.camera
-    wide = float(np.degrees(2 * np.arctan(2 * np.tan(np.radians(camera.fov_y_deg) / 2))))
-    own, cropped = (predict_files(engine, [str(path)], lens=fov)[0] for fov in (None, wide))
-    assert cropped["angle_rad"] > own["angle_rad"]
-
-
 @pytest.mark.parametrize("fov", [0.0, -10.0, 180.0, 400.0, np.nan, np.inf])
 def test_an_impossible_field_of_view_is_refused(
     tmp_path: Path, engine: BrightnessEngine, fov: float

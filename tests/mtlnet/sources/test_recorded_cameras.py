@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.run import predict_files
 from mtlnet.sources.recordings.cameras import calibration_topic
@@ -30,11 +29,6 @@ DISTORTION = (-0.2, 0.05, 0.001, -0.002, 0.01)
 IMAGE = np.random.default_rng(1).integers(0, 256, (420, 560, 3), dtype=np.uint8)
 MODEL = CameraParameters()
 OURS = replace(MODEL, width=560, height=420, matrix=MATRIX)
-
-
-@pytest.fixture
-def engine() -> BrightnessEngine:
-    return BrightnessEngine(read_card(resolve_run("default")))
 
 
 def bag(folder: Path, camera: dict[str, Any], topic: str = "/cam/image_raw") -> Path:

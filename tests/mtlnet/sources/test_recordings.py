@@ -15,7 +15,6 @@ import simplejpeg
 from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.sources.find import find_sources
 from tests.mtlnet.predict.brightness_engine import BrightnessEngine
@@ -34,11 +33,6 @@ from trackfeatures.errors import UserError
 COUNT = 5
 DISTORTED = (0.1, 0.0, 0.0, 0.0, 0.0)
 CAMERA = "/camera/image_raw"
-
-
-@pytest.fixture
-def engine() -> BrightnessEngine:
-    return BrightnessEngine(read_card(resolve_run("default")))
 
 
 def pictures(size: tuple[int, int] = (420, 560)) -> list[NDArray[np.uint8]]:

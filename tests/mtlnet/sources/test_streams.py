@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from mtlnet.inference.model_card import read_card, resolve_run
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.sources import streams
 from mtlnet.sources.streams import is_live, shown_name
@@ -60,11 +59,6 @@ def address() -> Iterator[str]:
     yield f"http://127.0.0.1:{server.server_port}"
     Camera.stopped.set()
     server.shutdown()
-
-
-@pytest.fixture
-def engine() -> BrightnessEngine:
-    return BrightnessEngine(read_card(resolve_run("default")))
 
 
 def test_a_stream_is_answered_to_its_end(

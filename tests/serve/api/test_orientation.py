@@ -1,38 +1,27 @@
 """Every endpoint first turns an image upright according to its EXIF orientation."""
 
 import json
-import struct
-import zlib
 
 import numpy as np
 import pytest
 from websockets.sync.client import connect
 
+from tests.mtlnet.inference.images import exif, in_jpeg, in_png, picture
 from tests.serve.conftest import (
     INFER,
     PATIENCE_S,
     FakeEngine,
     Served,
-    jpeg,
-    picture,
-    png,
     tensor_request,
 )
 
 WIDE = picture(480, 210)
 
 
-def exif(orientation: int) -> bytes:
-    return b"MM" + struct.pack(">HIHHHIHHI", 42, 8, 1, 0x0112, 3, 1, orientation, 0, 0)
-
-
 def stored_png(orientation: int) -> bytes:
     """A PNG file of `WIDE`, stored on its side (orientation 6, 8) or upside down (3)."""
     turns = {3: 2, 6: 1, 8: -1}
-    body = png(np.ascontiguousarray(np.rot90(WIDE, turns[orientation])[:, :, ::-1]))
-    chunk = b"eXIf" + exif(orientation)
-    chunk = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return body[:33] + chunk + body[33:]
+    return in_png(np.rot90(WIDE, turns[orientation]), exif(orientation))
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
@@ -53,9 +42,6 @@ def test_endpoints_see_the_upright_image(
 
 
 def test_a_jpeg_that_stands_on_its_side_is_refused_by_its_upright_size(service: Served) -> None:
-    block = b"Exif\0\0" + exif(6)
-    body = jpeg(picture())
-    body = body[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + body[2:]
-    reply = service.post(body)
+    reply = service.post(in_jpeg(picture(), exif(6)))
     assert (reply.status, reply.content["type"]) == (422, "/problems/image-aspect")
     assert reply.content["detail"].startswith("the image is 210 x 280 px")
