@@ -41,10 +41,6 @@ def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatAr
     return eye.place, ahead + u[None, :, None] * right - v[:, None, None] * up
 
 
-def test_class_names_and_their_order() -> None:
-    assert CLASSES == ("road", "marking", "car", "ground", "sky", "object")
-
-
 @pytest.mark.parametrize("lanes", [1, 3])
 def test_road_depth_equals_the_depth_of_the_track_surface(lanes: int) -> None:
     """The point that a road pixel shows, eye plus ray times depth, lies on the road plane."""

@@ -173,22 +173,6 @@ def test_full_controls_shift_gears_and_brake() -> None:
     env.close()
 
 
-def test_a_vector_environment_equals_two_single_environments() -> None:
-    vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
-    assert isinstance(vector, gym.vector.AsyncVectorEnv)
-    observations, _ = vector.reset(seed=[4, 5])
-    for _ in range(30):
-        observations, *_ = vector.step(np.array([[0.02], [-0.02]], np.float32))
-    vector.close()
-    for row, action in ((0, 0.02), (1, -0.02)):
-        env = make()
-        alone, _ = env.reset(seed=4 + row)
-        for _ in range(30):
-            alone, *_ = env.step(steer(action))
-        np.testing.assert_array_equal(observations[row], alone)
-        env.close()
-
-
 def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
     env = make(lane_width=4.1)
     world = env.unwrapped.world  # type: ignore[attr-defined]
@@ -316,8 +300,6 @@ def test_a_step_without_an_episode_is_refused() -> None:
     "code",
     [
         "import gymnasium, simulator; print(gymnasium.spec('driverview/DriverView-v0').id)",
-        "import gymnasium as g; e = g.make('simulator.env:driverview/DriverView-v0', width=64);"
-        "print(e.spec.id)",
         "import gymnasium as g; e = g.make_vec('simulator.env:driverview/DriverView-v0', 2,"
         "vectorization_mode='sync'); print(e.spec.id)",
     ],
