@@ -92,6 +92,8 @@ def outputs(
 
 
 JPEG, PNG = jpeg(picture()), png(picture())
+HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
+WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 INFER = "/v2/models/track/infer"
 
 

@@ -62,26 +62,6 @@ def refused(*arguments: str, folder: Path = ROOT) -> str:
     return done.stderr
 
 
-def test_a_published_model_is_served_until_sigterm(published: Path) -> None:
-    engine = load_engine(published)
-    image = golden_image(280, 210)
-    with started("--model", str(published), "--port", "0") as (process, line):
-        card = read_card(published)
-        assert str(published) in line
-        assert card.model_hash[:12] in line
-        assert f"openvino {engine.precision}" in line
-        with Client(address(line), timeout_s=PATIENCE_S) as client:
-            client.wait_until_ready(PATIENCE_S)
-            answer = client.features(png(image[:, :, ::-1]))
-        expected = decode_outputs(engine(image)).as_json()
-        assert {key: answer[key] for key in expected} == expected
-        assert answer["model"] == card.model_hash
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE_S) == 0
-        assert process.stderr is not None
-        assert process.stderr.read() == ""
-
-
 def test_serve_without_options_takes_the_shipped_or_latest_model_until_ctrl_c(
     published: Path,
 ) -> None:
@@ -92,6 +72,8 @@ def test_serve_without_options_takes_the_shipped_or_latest_model_until_ctrl_c(
         Client(address(line)).wait_until_ready(PATIENCE_S)
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
 
 
 def test_both_workers_behind_one_port_answer_alike_and_log_every_request(published: Path) -> None:
@@ -114,13 +96,16 @@ def test_both_workers_behind_one_port_answer_alike_and_log_every_request(publish
             connections[worker] = connection
         return worker
 
-    image = png(golden_image(280, 210)[:, :, ::-1])
+    engine, image = load_engine(published), png(golden_image(280, 210)[:, :, ::-1])
     with (
         ThreadPoolExecutor(1) as pool,
         started(*arguments) as (process, line),
         ExitStack() as stack,
     ):
         assert "2 workers" in line
+        assert str(published) in line
+        assert read_card(published).model_hash[:12] in line
+        assert f"openvino {engine.precision}" in line
         assert process.stderr is not None
         log = pool.submit(process.stderr.read)
         port = int(address(line).rpartition(":")[2])
@@ -144,8 +129,9 @@ def test_both_workers_behind_one_port_answer_alike_and_log_every_request(publish
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
         lines = [json.loads(text) for text in log.result().splitlines()]
-    expected = decode_outputs(load_engine(published)(golden_image(280, 210))).as_json()
+    expected = decode_outputs(engine(golden_image(280, 210))).as_json()
     assert {key: answers[0][key] for key in expected} == expected
+    assert answers[0]["model"] == read_card(published).model_hash
     assert all(answer == answers[0] for answer in answers)
     logged = {entry["request"]: entry for entry in lines if "request" in entry}
     assert {name: entry["status"] for name, entry in logged.items()} == {

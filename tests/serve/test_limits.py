@@ -15,8 +15,10 @@ from serve.scheduling.rate_limit import RateLimiter
 from serve.server.guard import EVICTABLE_S, ConnectionGuard, Group
 from tests.serve.attacks.conftest import read_rest
 from tests.serve.conftest import (
+    HEAD,
     JPEG,
     PATIENCE_S,
+    WHOLE,
     Clock,
     Gate,
     Served,
@@ -25,9 +27,6 @@ from tests.serve.conftest import (
     serving,
     until,
 )
-
-HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
-WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
 
 def dial(service: Served, source: str = "127.0.0.1") -> socket.socket:

@@ -17,8 +17,10 @@ from serve.scheduling.frame_queue import INLINE_AFTER, INLINE_MAX_MS
 from serve.server.fast_path import DirectProtocol
 from tests.serve.attacks.conftest import read_reply, read_rest, types_in_cycles
 from tests.serve.conftest import (
+    HEAD,
     JPEG,
     PATIENCE_S,
+    WHOLE,
     Clock,
     FakeEngine,
     Served,
@@ -29,9 +31,6 @@ from tests.serve.conftest import (
     serving,
     until,
 )
-
-HEAD = b"POST /features HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
-WHOLE = HEAD + b"Content-Length: %d\r\n\r\n" % len(JPEG) + JPEG
 
 
 class RecordingEngine(FakeEngine):
