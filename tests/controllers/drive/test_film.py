@@ -11,7 +11,6 @@ from controllers.drive.config import DriveConfig
 from controllers.drive.film import CURVE_HEIGHT, curves
 from controllers.drive.run import drive
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR
-from trackfeatures import UserError
 
 
 def frames(path: Path) -> list[NDArray[np.uint8]]:
@@ -47,14 +46,6 @@ def test_an_interrupted_film_contains_the_driven_part(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         drive(DriveConfig(steps=50, video=path), stop)
     assert len(frames(path)) == 5
-
-
-@pytest.mark.parametrize("name", ["drive.avi", "drive"])
-def test_another_suffix_is_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"ending in \.mp4"):
-        drive(DriveConfig(steps=5, video=tmp_path / name))
-    with pytest.raises(UserError, match="there is no folder"):
-        drive(DriveConfig(steps=5, video=tmp_path / "none" / "drive.mp4"))
 
 
 def test_curves_rise_to_the_left_and_have_gaps_without_perception() -> None:

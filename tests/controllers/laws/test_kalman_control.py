@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ STEPS = 900
 ESTIMATED = ("lqr-kalman", "mpc-kalman")
 
 
+@cache
 def driven(controller: str, disturbance: str) -> tuple[DriveResult, float]:
     """A drive from beside the line, and the mean change of its steering action in a step."""
     actions: list[float] = []

@@ -218,11 +218,6 @@ def test_a_service_that_fails_ends_the_drive(perceive_by: Callable[[Perceive], N
         drive(DriveConfig(steps=10, realtime=True))
 
 
-def test_a_simulated_delay_is_refused() -> None:
-    with pytest.raises(UserError, match="--latency-ms"):
-        drive(DriveConfig(steps=3, realtime=True, latency_ms=50.0))
-
-
 def test_a_blind_answer_is_no_answer() -> None:
     clock, car = Clock(), Straight()
     blind = Perceived(None, 0.0, RoadClass.STRAIGHT)

@@ -32,12 +32,7 @@ COMMAND = [sys.executable, "-m", "controllers", "record", *SHORT, "--lights", "c
 
 
 def record(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    command = [*COMMAND, "--out", str(out), *more]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600)
-
-
-def record_here(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    """Run the command in this process; for refusals before the first round."""
+    """Run the command in this process."""
     return typed(*COMMAND[2:], "--out", out, *more)
 
 
@@ -81,7 +76,7 @@ def test_the_plan_names_the_driver_and_another_one_is_refused(recorded: Path) ->
     driver = json.loads((recorded / "plan.json").read_text())["driver"]
     assert driver["controller"] == "lqr"
     assert len(driver["model"]) == 64
-    refused = record_here(recorded, "--controller", "lqr-preview")
+    refused = record(recorded, "--controller", "lqr-preview")
     assert refused.returncode != 0
     assert "driver: lqr, " in refused.stderr.replace("\n", " ")
     with pytest.raises(DatasetError, match="not by the scripted driver"):
@@ -118,7 +113,7 @@ def test_recordings_are_merged_with_rounds_of_another_plan(recorded: Path, tmp_p
     ],
 )
 def test_impossible_options_are_refused(tmp_path: Path, args: list[str], message: str) -> None:
-    done = record_here(tmp_path / "out", *args)
+    done = record(tmp_path / "out", *args)
     assert done.returncode != 0
     assert message in done.stderr.replace("\n", " ")
     assert "Traceback" not in done.stderr

@@ -5,20 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from datagen.driving.trajectory import max_offset
 from datagen.planning.class_balance import TrackForecast
 from datagen.planning.config import CollectConfig, TrackChoice
-from datagen.planning.plan import Plan, RoundPlan
+from datagen.planning.plan import Plan
 from datagen.planning.planner import make_plan
 from datagen.planning.summary import expected_classes
 from datagen.planning.tracks import choose_tracks
-from simulator.driving.speed import speed_profile
 from simulator.track.catalogue import find_track
-from simulator.track.random_roads.road import random_track
-from simulator.track.road import Road
 from tests.datagen.commands import datagen_here
 
 RANDOM = choose_tracks(("random",), None)
@@ -57,34 +52,6 @@ def test_no_heading_class_is_rare() -> None:
     forecast = TrackForecast.of(RANDOM, None)
     plan = make_plan(CollectConfig(rounds=20, frames=400, tracks=RANDOM), forecast)
     assert min(expected_classes(plan, forecast)["all"].values()) > 0.15
-
-
-def driven(entry: RoundPlan) -> tuple[float, np.ndarray]:
-    """Shares of a round's frames: in bends under 100 m or within 8 m of a change of curvature; and
-    in bends of 12 to 25, 25 to 50, 50 to 100 m (3,)."""
-    road = Road(random_track(entry.track), entry.lanes, entry.lane_width_m)
-    profile = speed_profile(road.track, entry.speed_kmh / 3.6, max_offset(road))
-    s, places = entry.start * road.track.length_m, []
-    for _ in range(entry.frames):
-        places.append(s)
-        s += profile.at(s) / entry.frequency_hz
-    curvature = road.track.at(np.array(places)[:, None] + np.arange(9)).curvature
-    bend = np.abs(curvature[:, 0])
-    hard = (bend > 0.01) | (np.abs(curvature - curvature[:, :1]) > 1e-9).any(axis=1)
-    radius = 1.0 / np.maximum(bend, 1e-9)
-    return float(hard.mean()), np.histogram(radius, (12, 25, 50, 100))[0] / entry.frames
-
-
-@pytest.mark.parametrize("rounds", [40, pytest.param(200, marks=pytest.mark.extended)])
-def test_half_of_the_frames_are_in_tight_bends_or_near_changes_log_evenly(rounds: int) -> None:
-    plan = make_plan(
-        CollectConfig(rounds=rounds, frames=400, tracks=RANDOM), TrackForecast.of(RANDOM, None)
-    )
-    shares, bins = zip(*(driven(entry) for entry in plan.rounds), strict=True)
-    assert 0.5 < np.mean(shares) < 0.65
-    octaves = np.mean(bins, axis=0)
-    assert octaves.min() > 0.09
-    assert octaves.max() < 1.5 * octaves.min()
 
 
 def test_a_dry_run_counts_random_roads_together() -> None:

@@ -1,20 +1,13 @@
 """The loader: each frame once an epoch; batches are a function of seed and step."""
 
 from collections.abc import Generator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mtlnet.data.loader import Loader
+from tests.datagen.recording.labels import labels_of
 from trackfeatures.camera import CameraParameters
-
-
-@dataclass(frozen=True)
-class FakeLabels:
-    distances: NDArray[np.float32]
-    angle: NDArray[np.float32]
-    heading: NDArray[np.int64]
 
 
 class FakeFrames:
@@ -23,7 +16,9 @@ class FakeFrames:
     def __init__(self, count: int) -> None:
         angle = np.linspace(-0.4, 0.4, count).astype(np.float32)
         distances = np.tile(np.array([-2, 2, np.nan, np.nan, np.nan], np.float32), (count, 1))
-        self.labels = FakeLabels(distances, angle, np.arange(count) % 3)
+        self.labels = labels_of(
+            count, distances=distances, angle=angle, heading=np.arange(count) % 3
+        )
 
     def __len__(self) -> int:
         return len(self.labels.angle)

@@ -9,6 +9,7 @@ import pytest
 import trackfeatures as tf
 from datagen.recording import Labels
 from mtlnet.evaluation.metrics import GROUPS, evaluate_by_groups, evaluate_outputs, presence
+from tests.datagen.recording.labels import labels_of
 
 NAN = float("nan")
 TRUE = [
@@ -35,23 +36,7 @@ MEAN = {
 
 
 def labels() -> Labels:
-    zeros, count = np.zeros(4, np.float32), np.ones(4, np.int64)
-    distances = np.array(TRUE, np.float32)
-    return Labels(
-        distances=distances,
-        angle=np.array(ANGLE, np.float32),
-        heading=HEADING,
-        lanes=count,
-        lane_index=count * 0,
-        curvature=zeros,
-        to_lane_centre=tf.localise(distances).astype(np.float32),
-        to_middle=zeros,
-        s=zeros,
-        speed=zeros,
-        shadow_fraction=zeros,
-        light=np.full(4, "clear"),
-        round=count * 0,
-    )
+    return labels_of(4, distances=TRUE, angle=np.array(ANGLE, np.float32), heading=HEADING)
 
 
 OUTPUTS = np.concatenate(
@@ -128,17 +113,15 @@ def many(count: int) -> tuple[np.ndarray, Labels]:
     coded = tf.encode(predicted, angle + 0.01)
     uncertainty = np.tile([0.05] * 5 + [0.05 / 2**0.5, 0.02, 0.5], (count, 1))
     outputs = np.concatenate([coded, np.tile([0.2, 0.5, 0.3], (count, 1)), uncertainty], 1)
-    lanes, zeros = rng.integers(1, 4, count), np.zeros(count, np.float32)
-    found = Labels(
+    lanes = rng.integers(1, 4, count)
+    found = labels_of(
+        count,
         distances=distances,
         angle=angle,
         heading=rng.integers(0, 3, count),
         lanes=lanes,
-        lane_index=lanes * 0,
         curvature=rng.uniform(-0.04, 0.04, count).astype(np.float32),
         to_lane_centre=column[:, 0],
-        to_middle=zeros,
-        s=zeros,
         speed=rng.uniform(5, 25, count).astype(np.float32),
         shadow_fraction=rng.uniform(0, 1, count).astype(np.float32),
         light=rng.choice(["fog", "rain"], count),

@@ -8,6 +8,7 @@ import pytest
 import trackfeatures as tf
 from datagen.recording.integrity.label_consistency import label_problems
 from datagen.recording.labels import Labels
+from tests.datagen.recording.labels import labels_of
 
 WIDTH = 4.0
 
@@ -17,21 +18,13 @@ def _labels(offsets: np.ndarray, lanes: int, width: float = WIDTH) -> Labels:
     features = [tf.measure(y, 0.0, 0.0, 0.0, lanes, width) for y in offsets.tolist()]
     distances = np.array([[*f.distances.values()] for f in features], dtype=np.float64)
     centre = np.array([f.to_lane_centre for f in features], dtype=np.float64)
-    zeros = np.zeros(len(offsets), dtype=np.float32)
-    return Labels(
-        distances=distances.astype(np.float32),
-        angle=zeros,
-        heading=np.ones(len(offsets), dtype=np.int64),
+    return labels_of(
+        len(offsets),
+        distances=distances,
         lanes=np.full(len(offsets), lanes),
         lane_index=np.array([tf.lane_index(y, lanes, width) for y in offsets.tolist()]),
-        curvature=zeros,
         to_lane_centre=centre.astype(np.float32),
         to_middle=offsets.astype(np.float32),
-        s=zeros,
-        speed=zeros,
-        shadow_fraction=zeros,
-        light=np.full(len(offsets), "clear"),
-        round=np.zeros(len(offsets), dtype=np.int64),
     )
 
 
