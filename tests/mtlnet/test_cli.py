@@ -33,16 +33,6 @@ def refused(*arguments: object, folder: Path | None = None) -> str:
     return last
 
 
-def test_help_imports_nothing_heavy() -> None:
-    code = (
-        "import sys, mtlnet.cli, typer.testing as t;"
-        "t.CliRunner().invoke(mtlnet.cli.app, ['train', '--help']);"
-        "print([m for m in ('torch', 'openvino', 'cv2', 'mcap') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_the_service_needs_no_torch(published: Path) -> None:
     code = (
         "import sys, numpy as np; from pathlib import Path;"

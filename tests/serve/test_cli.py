@@ -167,19 +167,6 @@ def test_a_taken_port_and_an_unknown_host_are_errors_of_one_line(published: Path
     assert "no.such.host" in refused("--model", str(published), "--host", "no.such.host")
 
 
-def test_help_loads_nothing_heavy() -> None:
-    """The test checks the loaded modules, because a time would depend on the machine."""
-    code = (
-        "import sys; from serve.cli import app; sys.argv[1:] = ['--help']\n"
-        "try: app()\n"
-        "finally: print({'cv2', 'openvino', 'fastapi', 'torch'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "--workers" in done.stdout
-    assert done.stdout.splitlines()[-1] == "set()"
-
-
 def test_a_faulty_camera_ends_the_command(tmp_path: Path) -> None:
     assert "give NAME=FILE" in refused("--camera", "roof", "--port", "0")
     path = tmp_path / "roof.yaml"

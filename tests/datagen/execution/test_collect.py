@@ -3,8 +3,6 @@
 import itertools
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -228,15 +226,6 @@ def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_
     assert verify(folder, "deep").ok
     info = datagen_here("info", folder).stdout
     assert "unseen: 20 frames" in info
-
-
-def test_help_is_quick() -> None:
-    code = "import sys, datagen.cli; print(*sorted({m.split('.')[0] for m in sys.modules}))"
-    loaded = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    heavy = {"numba", "pybullet", "moderngl", "cv2", "mcap", "simulator"}
-    assert not heavy & set(loaded.stdout.split())
 
 
 def test_the_help_of_lights_names_every_light() -> None:

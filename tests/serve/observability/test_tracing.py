@@ -202,12 +202,13 @@ def test_environment_variables_switch_tracing() -> None:
 
 
 def test_without_tracing_no_exporter_is_loaded_or_endpoint_wrapped(service: Served) -> None:
-    """The OpenTelemetry API may be loaded, because FastAPI imports it."""
+    """Nor torch or physics. The OpenTelemetry API may be loaded, because FastAPI imports it."""
     code = (
-        "import sys, serve.worker, serve.launch\n"
+        "import sys, serve.app, serve.worker, serve.launch, serve.client\n"
         "from serve.observability import telemetry\n"
         "assert telemetry.tracer() is None\n"
-        "print({'opentelemetry.sdk', 'opentelemetry.exporter', 'serve.observability.tracing'}"
+        "print({'opentelemetry.sdk', 'opentelemetry.exporter', 'serve.observability.tracing',"
+        " 'torch', 'pybullet', 'simulator', 'datagen', 'numba', 'moderngl', 'mcap'}"
         " & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

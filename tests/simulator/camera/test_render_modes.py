@@ -256,17 +256,6 @@ def test_calibration_matches_the_projection(road: Road, view: str) -> None:
     assert ahead.sum() > 50
 
 
-@pytest.mark.parametrize("size", [(280, 210), (64, 48), (1920, 1080), (100, 300)])
-@pytest.mark.parametrize("fov", [20.0, 67.5, 120.0])
-def test_intrinsics_follow_size_and_field_of_view(size: tuple[int, int], fov: float) -> None:
-    width, height = size
-    matrix = CameraParameters(width, height, fov).intrinsics()
-    up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (-0.5, height - 0.5))
-    assert np.degrees(down - up) == pytest.approx(fov)
-    centre = ((width - 1) / 2, (height - 1) / 2)
-    assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (*centre, matrix[1, 1])
-
-
 def test_colourise_maps_depth_and_class_to_colours(road: Road) -> None:
     depth = np.array([[2.0, 30.0, 499.0, np.inf]], dtype=np.float32)
     near, middle, far, sky = colourise(depth, "depth")[0].astype(int)

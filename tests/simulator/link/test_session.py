@@ -78,14 +78,6 @@ def test_a_bad_command_is_refused_and_the_car_is_unchanged(
         assert link.step(Command(throttle=0.5)).step == 2
 
 
-def test_values_beyond_a_bound_by_the_rounding_of_float32_are_clipped(oval: str) -> None:
-    with Link(oval, wait_s=WAIT_S) as link:
-        start = link.reset(seed=1, to_middle=link.info.edge + 1e-6, angle=0.1)
-        assert start.state.to_middle == pytest.approx(link.info.edge, abs=1e-9)
-        link.reset(seed=1)
-        assert link.step(Command(steer=1.0000001, throttle=-1e-7)).step == 1
-
-
 @pytest.mark.parametrize(
     ("start", "said"),
     [

@@ -14,8 +14,8 @@ from trackfeatures.errors import UserError
 NAN, INF = math.nan, math.inf
 
 
-def road(lanes: int = 1) -> Road:
-    return Road(find_track("oval"), lanes)
+def road() -> Road:
+    return Road(find_track("oval"), 1)
 
 
 @pytest.mark.parametrize("frequency", [0, -20, 30, 400, 0.5, 20.5, NAN])
@@ -34,18 +34,6 @@ def test_bad_traffic_counts_are_refused(count: int) -> None:
 def test_traffic_counts_that_are_not_integers_are_refused(count: Any) -> None:
     with pytest.raises(UserError, match="give a whole number"):
         World(road(), traffic=count)
-
-
-@pytest.mark.parametrize("lanes", [0, -1, 4, 100])
-def test_bad_lane_counts_are_refused(lanes: int) -> None:
-    with pytest.raises(UserError, match="lane"):
-        road(lanes)
-
-
-@pytest.mark.parametrize("width", [0.0, 2.6, 4.6, NAN])
-def test_bad_lane_widths_are_refused(width: float) -> None:
-    with pytest.raises(UserError, match="lane"):
-        Road(find_track("oval"), 1, width)
 
 
 @pytest.mark.parametrize(
