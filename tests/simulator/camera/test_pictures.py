@@ -81,6 +81,20 @@ def test_views_differ_from_each_other(road: Road) -> None:
                 assert np.abs(picture - pictures[other]).mean() > 5.0, (view, other)
 
 
+def test_projection_follows_the_mount(road: Road) -> None:
+    """A point straight ahead of the mount projects to the middle, one to the left, left of it."""
+    pose = np.array([10.0, 20.0, 3.0, 0.0, 0.0, np.pi / 2])
+    with Camera(road, CameraParameters(x=1.0, z=0.5), seed=1, light=light()) as camera:
+        points = np.array([[10.0, 31.0, 3.5], [9.0, 31.0, 3.5], [10.0, 31.0, 4.5], [10, 0, 3.5]])
+        pixels, depth = camera.project(points, pose)
+        focal = camera.intrinsics[0, 0]
+    assert depth == pytest.approx([10.0, 10.0, 10.0, -21.0])
+    assert pixels[0] == pytest.approx([139.5, 104.5])
+    assert pixels[1] == pytest.approx([139.5 - focal / 10, 104.5])
+    assert pixels[2] == pytest.approx([139.5, 104.5 - focal / 10])
+    assert np.isnan(pixels[3]).all()
+
+
 def test_overcast_and_fog_cast_no_hard_shadows(road: Road) -> None:
     pose = standing_pose(road, 100.0, 0.0)
     for kind in ("overcast", "fog"):
