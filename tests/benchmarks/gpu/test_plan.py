@@ -19,8 +19,6 @@ from mtlnet.inference.model_card import SHIPPED, read_card
 from mtlnet.inference.trained_rounds import Seeds
 from trackfeatures.errors import UserError
 
-ROOT = Path(__file__).parents[3]
-
 
 def test_deadlines_are_shares_of_the_minutes() -> None:
     plan = Plan(10.0)

@@ -11,8 +11,6 @@ import pytest
 from benchmarks.gpu import process
 from benchmarks.gpu.process import Command, Interrupted
 
-ROOT = Path(__file__).parents[3]
-
 
 def shell(folder: Path, script: str, name: str = "one") -> Command:
     return Command(("sh", "-c", script), folder / f"{name}.out", folder / f"{name}.log")

@@ -78,9 +78,9 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
     [
         ("mountain-pass", "overcast"),
         ("oval", "overcast"),
-        ("circuit", "overcast"),
+        pytest.param("circuit", "overcast", marks=pytest.mark.extended),
         ("town", "overcast"),
-        ("mountain-pass", "rain"),
+        pytest.param("mountain-pass", "rain", marks=pytest.mark.extended),
         ("town", "rain"),
     ],
 )
