@@ -78,7 +78,7 @@ def test_candidates_stay_within_their_ranges() -> None:
         ({"controllers": "torcs"}, "'torcs' cannot be tuned; use some of: lqr"),
         ({"reward": "speed"}, "no reward 'speed'"),
         ({"budget": 0}, "budget of 0"),
-        ({"disturbance": "storm"}, "no disturbance 'storm'"),
+        ({"disturbance": "storm"}, "no disturbance 'storm'; use one of: none, noise"),
         ({"tracks": "oval,nowhere", "budget": 1, "steps": 20, "controllers": "lqr"}, "nowhere"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import json
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -13,11 +12,8 @@ import pytest
 import simplejpeg
 from websockets.exceptions import ConnectionClosed
 
-from controllers.drive.config import DriveConfig
-from controllers.drive.run import drive
 from simulator.watch.pictures import SIZE
 from tests.simulator.watch.test_drive import Page
-from trackfeatures import UserError
 
 STEPS = 160
 
@@ -63,10 +59,3 @@ def test_a_drive_is_shown_live_and_the_page_ends_with_it() -> None:
     }
     assert states[-1]["to_middle"] == pytest.approx(2.0, abs=0.2)
     assert states[-1]["time_s"] > states[0]["time_s"]
-
-
-def test_a_port_in_use_is_refused() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(UserError, match=f"port {port}: Address already in use"):
-            drive(DriveConfig(steps=3, watch=port))

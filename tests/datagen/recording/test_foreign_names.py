@@ -22,7 +22,6 @@ from datagen.recording.folder import (
 from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.splits import read_split, split_path
 from tests.datagen.commands import make_small_plan
-from trackfeatures.errors import UserError
 from trackfeatures.names import BadName
 
 WAYS_OUT = ["../../precious", "..", ".", "", "a/b", "/tmp/driverview-no-such", "a\0b"]
@@ -107,7 +106,3 @@ def test_plan_split_and_metadata_are_checked_when_they_are_read(
     header.validate()
     with pytest.raises(BadName):
         replace(header, id="../x").validate()
-
-
-def test_a_bad_name_is_a_users_error() -> None:
-    assert issubclass(BadName, UserError)

@@ -64,11 +64,6 @@ def detail_far_away(kind: str) -> float:
     return float(np.mean(found))
 
 
-def test_a_light_of_a_weather_has_its_name() -> None:
-    for kind in KINDS:
-        assert light(kind).weather == (kind if kind in WEATHERS else "")
-
-
 def test_snow_is_white_and_rain_is_dark_and_grey() -> None:
     assert ground("snow").mean() > 1.8 * ground("overcast").mean()
     asphalt = {kind: pictures(kind)[:, 180:, 110:170].mean() for kind in ("overcast", "rain")}
