@@ -223,9 +223,9 @@ def test_the_graph_gives_the_probabilities_of_absence() -> None:
     # The graph for the fit of the uncertainty head gives that head's inputs too.
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     graph = openvino_core().compile_model(build_feature_graph(network), "CPU", options)
-    rows = [graph(frame[None]) for frame in frames]
+    singly = [graph(frame[None]) for frame in frames]
     assert np.ptp(answers.outputs[:, :6], axis=0).max() > 0.05
-    np.testing.assert_allclose([row[0][0] for row in rows], answers.outputs, atol=TOLERANCE)
+    np.testing.assert_allclose([row[0][0] for row in singly], answers.outputs, atol=TOLERANCE)
     inputs = answers.uncertainty_inputs
     assert inputs.shape == (6, GRID.uncertainty_inputs)
-    np.testing.assert_allclose([row[1][0] for row in rows], inputs, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose([row[1][0] for row in singly], inputs, rtol=1e-3, atol=1e-4)

@@ -29,7 +29,7 @@ from tests.mtlnet.conftest import write_dataset
 from tests.mtlnet.ood_images import images_without_road, seen_by
 from trackfeatures.camera import CameraParameters
 
-OOD_IMAGES = 1000
+OOD_IMAGES = 400
 ROOT = Path(__file__).parents[3]
 
 

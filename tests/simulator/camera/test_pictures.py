@@ -43,7 +43,7 @@ def test_the_same_seed_gives_the_same_bytes(road: Road) -> None:
 def hash_of_a_picture() -> str:
     road = Road(find_track("town"), 1)
     with Camera(road, seed=3, light=light("dusk", 2)) as camera:
-        return hashlib.sha256(camera.render(standing_pose(road, 50.0, 0.0))).hexdigest()
+        return hashlib.sha256(camera.render(standing_pose(road, 50.0, 0.0)).tobytes()).hexdigest()
 
 
 def test_another_process_draws_the_same_bytes() -> None:
