@@ -220,12 +220,16 @@ def test_the_graph_gives_the_probabilities_of_absence() -> None:
         assert prediction.absent is not None
         for name, limit in zip(tf.MARKINGS, ABSENT_ABOVE, strict=True):
             assert prediction.distances_m[name] is None or prediction.absent[name] <= limit
-    # The graph for the fit of the uncertainty head gives that head's inputs too.
+
+
+def test_the_graph_reads_bins_as_torch_does() -> None:
+    network, frames = fold(made()), images(12, 5)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     graph = openvino_core().compile_model(build_feature_graph(network), "CPU", options)
-    singly = [graph(frame[None]) for frame in frames]
-    assert np.ptp(answers.outputs[:, :6], axis=0).max() > 0.05
-    np.testing.assert_allclose([row[0][0] for row in singly], answers.outputs, atol=TOLERANCE)
-    inputs = answers.uncertainty_inputs
-    assert inputs.shape == (6, GRID.uncertainty_inputs)
-    np.testing.assert_allclose([row[1][0] for row in singly], inputs, rtol=1e-3, atol=1e-4)
+    answers = run_network(network, frames)
+    inputs, expected = answers.uncertainty_inputs, answers.outputs
+    found = [graph(frame[None]) for frame in frames]
+    assert np.ptp(expected[:, :6], axis=0).max() > 0.05
+    np.testing.assert_allclose([row[0][0] for row in found], expected, atol=TOLERANCE)
+    assert inputs.shape == (12, GRID.uncertainty_inputs)
+    np.testing.assert_allclose([row[1][0] for row in found], inputs, rtol=1e-3, atol=1e-4)

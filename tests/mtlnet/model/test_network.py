@@ -1,4 +1,4 @@
-"""The paper's network: layers, padding, parameter count."""
+"""The paper's network: layers, padding, parameter count; folding keeps the outputs."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ import torch
 from mtlnet.architecture import FEATURES, GRID, SHARED, Conv, same_padding
 from mtlnet.model.network import (
     Network,
+    fold,
     initialise,
     normalise,
     predict_images,
@@ -94,6 +95,26 @@ def test_first_layer_against_a_sum_by_hand() -> None:
         patch = padded[row * 4 : row * 4 + 11, column * 4 : column * 4 + 11]
         expected = np.maximum(np.einsum("hwc,fchw->f", patch, weight), 0)
         np.testing.assert_allclose(out[0, :, row, column].detach().numpy(), expected, atol=1e-4)
+
+
+def test_folding_keeps_the_outputs() -> None:
+    network = Network(batch_norm=True, dropout=0.1)
+    initialise(network, 2)
+    network.train()
+    with torch.no_grad():
+        network(images(4))  # updates the running statistics
+        for module in network.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                module.weight.uniform_(0.5, 1.5)
+                module.bias.uniform_(-0.5, 0.5)
+    network.target_mean.copy_(torch.linspace(0.2, 0.7, 6))
+    network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
+    folded = fold(network)
+    assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    network.eval()
+    with torch.no_grad():
+        difference = (network(images(4, seed=1)) - folded(images(4, seed=1))).abs().max()
+    assert float(difference) < 2e-5
 
 
 def test_probabilities_sum_to_one_and_the_seed_determines_the_weights() -> None:

@@ -70,6 +70,19 @@ def test_a_batch_that_does_not_divide_among_the_processes_is_refused() -> None:
         pass
 
 
+def masks(rank: int, step: int = 0) -> torch.Tensor:
+    """Dropout masks that torch draws in a process."""
+    torch.manual_seed(dropout_seed(7, rank, step))
+    return torch.nn.functional.dropout(torch.ones(64), 0.5)
+
+
+def test_every_process_draws_other_dropout_masks() -> None:
+    drawn = [masks(rank, step) for rank in range(4) for step in (0, 60)]
+    for i, one in enumerate(drawn):
+        assert not any(torch.equal(one, other) for other in drawn[:i])
+    assert torch.equal(masks(2, 60), masks(2, 60))
+
+
 def test_the_first_process_of_a_new_run_draws_masks_from_the_seed_of_the_run() -> None:
     assert dropout_seed(7, rank=0) == 7
 

@@ -7,13 +7,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from datagen.recording import Dataset
+from mtlnet.architecture import GRID
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import WEIGHTS, read_card
 from mtlnet.inference.prediction import decode_outputs, split_outputs
-from mtlnet.model.network import load_network, predict_images
+from mtlnet.model.network import Network, initialise, load_network, predict_images
+from mtlnet.model.pretrained import load_pretrained
 from mtlnet.train import start_training
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.configure import open_pretrained
@@ -37,6 +40,28 @@ def custom_images(dataset: Path, tmp_path: Path) -> Path:
         lines.append(f"{i}.png,-1.{i},2.{9 - i},,,,{0.01 * i},straight")
     (folder / "labels.csv").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def test_fine_tuning_starts_with_the_outputs_of_the_model(published: Path) -> None:
+    network = Network()
+    network.target_mean.copy_(torch.linspace(0.2, 0.7, 6))
+    network.target_std.copy_(torch.linspace(0.02, 0.3, 6))
+    load_pretrained(network, published / WEIGHTS)
+    frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
+    expected = predict_images(load_network(published / WEIGHTS), frames)
+    np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
+
+
+def test_fine_tuning_a_network_with_bins_starts_with_its_outputs(tmp_path: Path) -> None:
+    trained = Network(architecture=GRID)
+    initialise(trained, 3)
+    save_file(trained.state_dict(), tmp_path / WEIGHTS)
+    network = Network(architecture=GRID)
+    network.target_std.copy_(torch.linspace(0.02, 0.3, 6))  # set from the images, not used
+    load_pretrained(network, tmp_path / WEIGHTS)
+    frames = np.random.default_rng(0).integers(0, 256, (2, 210, 280, 3), dtype=np.uint8)
+    expected = predict_images(trained.eval(), frames)
+    np.testing.assert_allclose(predict_images(network, frames), expected, atol=1e-5)
 
 
 def test_fine_tuning_on_custom_images_lowers_their_error(

@@ -18,6 +18,7 @@ from mtlnet.training.checkpoint import list_checkpoints
 from mtlnet.training.config import TrainConfig
 from mtlnet.training.configure import resume_config
 from mtlnet.training.logging import CurveLog
+from runtime.files import atomic_write
 from runtime.tensorboard import TensorBoardWriter
 from trackfeatures.errors import UserError
 
@@ -39,6 +40,17 @@ def left_over(run: Path) -> list[str]:
 
 def point(step: int) -> dict[str, float]:
     return dict.fromkeys(COLUMNS, 0.5) | {"step": step}
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    atomic_write(path, b"old")
+    monkeypatch.setattr("runtime.files.os.fsync", full)
+    with pytest.raises(OSError, match="No space") as caught:
+        atomic_write(path, b"new", fsync=True)
+    assert caught.value.filename == str(path)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_new_run_that_cannot_be_written_leaves_no_folder(

@@ -12,6 +12,8 @@ from mtlnet.training.optimizers import (
     GramMuon,
     OptimizerSet,
     as_matrix,
+    orthogonalize_each,
+    orthogonalize_together,
     uses_muon,
 )
 from mtlnet.training.recipes import RECIPES, Recipe
@@ -95,6 +97,27 @@ def test_steps_equal_those_of_torchs_muon(shape: tuple[int, int]) -> None:
         torch.testing.assert_close(optimizers[0].state[ours][name], state)
 
 
+def test_muon_iterates_on_layers_together_as_on_each() -> None:
+    """Numbers for which every product and sum is exact in float32, on any processor."""
+    generator = torch.Generator().manual_seed(0)
+
+    def signs(*shape: int) -> torch.Tensor:
+        return torch.randint(0, 2, shape, generator=generator) * 2.0 - 1.0
+
+    # Each with 4^k entries of +-1, so that its norm is a power of two.
+    matrices = [signs(8, 8), signs(4, 16), signs(32, 8), signs(8, 32), signs(4, 4)]
+    exact = (2.0, -1.0, 0.5)
+    each = list(orthogonalize_each(matrices, exact, 1, 1e-7))
+    together = orthogonalize_together(matrices, exact, 1, 1e-7)
+    for matrix, one, other in zip(matrices, each, together, strict=True):
+        assert one.shape == matrix.shape
+        assert torch.equal(one, other)
+    # By hand: with G = X X^T the result is (2 - G + G^2 / 2) X.
+    x = matrices[1] / 8
+    gram = x @ x.T
+    assert torch.equal(together[1], (2 * torch.eye(4) - gram + gram @ gram / 2) @ x)
+
+
 def test_muon_of_layers_together_takes_the_steps_of_each() -> None:
     generator = torch.Generator().manual_seed(0)
     starts = [torch.randn(s, generator=generator) for s in ((16, 64), (64, 16), (16, 40), (8, 9))]
@@ -118,3 +141,11 @@ def test_a_gradient_of_zero_changes_nothing() -> None:
     weight.grad = torch.zeros(4, 8)
     GramMuon([weight], 0.02, 0.0).step()
     torch.testing.assert_close(weight.detach(), torch.ones(4, 8))
+
+
+def test_the_learning_rate_of_muon_is_scaled() -> None:
+    _, optimizers = build(RECIPES["fast"])
+    optimizers.set_learning_rate(4e-4)
+    rates = [group["lr"] for part in optimizers.optimizers for group in part.param_groups]
+    assert rates == [4e-4 * MUON_LR_SCALE, 4e-4, 4e-4]
+    assert optimizers.learning_rate == 4e-4

@@ -13,7 +13,7 @@ from datagen.recording import Dataset
 from mtlnet.evaluation.metrics import calibration, coverage
 from mtlnet.inference.engine import Precision, load_engine
 from mtlnet.inference.model_card import WEIGHTS, resolve_run
-from mtlnet.inference.prediction import decode_outputs, split_outputs
+from mtlnet.inference.prediction import FEATURES, OUTPUTS, decode_outputs, split_outputs
 from mtlnet.inference.torch_engine import read_uncertainty_head
 from mtlnet.model.network import load_network
 from mtlnet.model.textures import CELL_VALUES, LIGHT_VALUES, light_features, texture_features
@@ -29,7 +29,7 @@ from tests.mtlnet.conftest import write_dataset
 from tests.mtlnet.ood_images import images_without_road, seen_by
 from trackfeatures.camera import CameraParameters
 
-OOD_IMAGES = 400
+OOD_IMAGES = 1000
 ROOT = Path(__file__).parents[3]
 
 
@@ -129,6 +129,37 @@ def test_texture_distance_has_the_given_false_alarm_rate() -> None:
     assert float((squared > 1).mean()) == pytest.approx(0.01, abs=0.007)
     far = new + 8 * mixing[0]
     assert float(((((far - mean) @ directions.T) ** 2).sum(1) > 1).mean()) > 0.99
+
+
+def test_texture_features_of_a_step_edge() -> None:
+    image = np.zeros((210, 280, 3), np.uint8)
+    image[:, 70:] = 255  # where the third of eight cell columns begins
+    features = textures_of([image])[0]
+    cells = features[:CELL_VALUES].reshape(5, 14, 8)
+    centre = features[CELL_VALUES:].reshape(5, 24, 4)
+    assert cells[:3, :, :2] == pytest.approx(-1)
+    assert cells[:3, :, 2:] == pytest.approx(1)
+    assert cells[3, :, 1] == pytest.approx((2 / 35) ** 0.5, rel=1e-3)  # one step of 2 in 35 pixels
+    assert np.delete(cells[3], 1, 1) == pytest.approx(1e-3)
+    assert cells[4] == pytest.approx(1e-3)
+    assert centre[:3] == pytest.approx(1)
+    image[:50] = 0  # up to the second band (5 rows) of the centre, which begins at row 45
+    centre = textures_of([image])[0, CELL_VALUES:].reshape(5, 24, 4)
+    assert centre[0, 0] == pytest.approx(-1)
+    assert centre[0, 1:] == pytest.approx(1)
+    assert centre[4, 0] == pytest.approx((2 / 5) ** 0.5, rel=1e-3)
+    assert centre[4, 1:] == pytest.approx(1e-3)
+
+
+def test_the_light_of_an_image_is_told_of_each_half() -> None:
+    image = np.full((210, 280, 3), 255, np.uint8)
+    image[105:] = (0, 51, 102)
+    light = light_features(torch.from_numpy(textures_of([image]))).numpy().reshape(5, 2)
+    assert light[:3, 0] == pytest.approx(1)
+    assert light[:3, 1] == pytest.approx([-1, -0.6, -0.2], abs=1e-5)
+    assert light[3] == pytest.approx(1e-3)  # no edge across
+    step = (1.6 / 15) ** 0.5  # in one of seven rows of cells, of 15 pixels each
+    assert light[4] == pytest.approx([(step + 6e-3) / 7, 1e-3], rel=1e-3)
 
 
 def test_standard_deviations_follow_the_light_within_limits(
@@ -243,3 +274,12 @@ def test_a_view_matches_that_cameras_image(dataset: Path) -> None:
     inside = np.s_[50:160, 75:205]
     # The expected image is shifted by half a pixel.
     assert np.abs(found[inside].astype(int) - expected[inside]).mean() < 6
+
+
+def test_predictions_have_standard_deviations_and_ood_flag(published: Path) -> None:
+    outputs = load_engine(published)(np.zeros((210, 280, 3), np.uint8))
+    assert outputs.shape == (OUTPUTS + len(FEATURES) + 1,)
+    prediction = decode_outputs(outputs)
+    assert prediction.out_of_distribution is True
+    assert prediction.std is not None
+    assert prediction.std["angle"] == pytest.approx(outputs[OUTPUTS + 6])

@@ -78,9 +78,9 @@ def _errors(camera: Camera, bare: Camera, pose: FloatArray, s: float) -> FloatAr
     [
         ("mountain-pass", "overcast"),
         ("oval", "overcast"),
-        pytest.param("circuit", "overcast", marks=pytest.mark.extended),
+        ("circuit", "overcast"),
         ("town", "overcast"),
-        pytest.param("mountain-pass", "rain", marks=pytest.mark.extended),
+        ("mountain-pass", "rain"),
         ("town", "rain"),
     ],
 )

@@ -1,6 +1,5 @@
 """Rendered images: sizes, views, determinism, lights, shadows, cars, memory."""
 
-import hashlib
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +10,9 @@ import numpy as np
 import pytest
 
 from simulator.camera import KINDS, VIEWS, Camera, Light
+from simulator.camera.core import context as camera_context
+from simulator.camera.overlay import marking_polylines
+from simulator.camera.scene.cars import WIDTH_M
 from simulator.camera.snapshot import standing_pose, write_contact_sheet
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -40,17 +42,23 @@ def test_the_same_seed_gives_the_same_bytes(road: Road) -> None:
     assert np.mean(pictures[0] != pictures[2]) > 0.05
 
 
-def hash_of_a_picture() -> str:
-    road = Road(find_track("town"), 1)
-    with Camera(road, seed=3, light=light("dusk", 2)) as camera:
-        return hashlib.sha256(camera.render(standing_pose(road, 50.0, 0.0)).tobytes()).hexdigest()
-
-
 def test_another_process_draws_the_same_bytes() -> None:
-    code = "import tests.simulator.camera.test_pictures as t; print(t.hash_of_a_picture())"
-    command = [sys.executable, "-c", code]
-    there = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert there.stdout.strip() == hash_of_a_picture()
+    code = (
+        "import hashlib, numpy as np\n"
+        "from simulator.camera import Camera, Light\n"
+        "from simulator.camera.snapshot import standing_pose\n"
+        "from simulator.track.catalogue import find_track\n"
+        "from simulator.track.road import Road\n"
+        "road = Road(find_track('town'), 1)\n"
+        "camera = Camera(road, seed=3, light=Light.named('dusk', np.random.default_rng(2)))\n"
+        "print(hashlib.sha256(camera.render(standing_pose(road, 50.0, 0.0))).hexdigest())\n"
+    )
+    runs = [
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    assert runs[0].stdout == runs[1].stdout
+    assert len(runs[0].stdout.strip()) == 64
 
 
 @pytest.mark.parametrize("size", [(64, 64), (280, 210), (333, 97), (640, 480)])
@@ -58,8 +66,12 @@ def test_images_of_any_size_show_sky_above_asphalt(road: Road, size: tuple[int, 
     width, height = size
     with Camera(road, CameraParameters(width, height), seed=1, light=light()) as camera:
         picture = camera.render(standing_pose(road, 30.0, 0.0))
+        matrix = camera.intrinsics
     assert picture.shape == (height, width, 3)
     assert picture.dtype == np.uint8
+    assert matrix[0, 0] == matrix[1, 1]
+    assert (matrix[0, 2], matrix[1, 2]) == ((width - 1) / 2, (height - 1) / 2)
+    assert 2 * np.degrees(np.arctan(height / 2 / matrix[1, 1])) == pytest.approx(67.5)
     # Blue above, grey asphalt below.
     sky = picture[: height // 8].reshape(-1, 3).mean(axis=0)
     asphalt = picture[-height // 8 :, width // 3 : width // 2].reshape(-1, 3).mean(axis=0)
@@ -93,6 +105,43 @@ def test_projection_follows_the_mount(road: Road) -> None:
     assert pixels[1] == pytest.approx([139.5 - focal / 10, 104.5])
     assert pixels[2] == pytest.approx([139.5, 104.5 - focal / 10])
     assert np.isnan(pixels[3]).all()
+
+
+def test_a_car_is_drawn_at_its_projected_pose(road: Road) -> None:
+    with Camera(road, seed=1, light=light("overcast")) as camera:
+        pose = standing_pose(road, 100.0, 0.0)
+        alone = camera.render(pose).astype(np.float64)
+        for gap, y in ((12.0, 2.0), (25.0, -2.0), (40.0, 2.0)):
+            car = standing_pose(road, 100.0 + gap, y, height=0.0)
+            changed = np.abs(camera.render(pose, car[None]) - alone).sum(axis=2) > 40
+            rows, columns = np.nonzero(changed)
+            rear = standing_pose(road, 100.0 + gap - 2.2, y, height=0.0)[:3]
+            (foot,), (depth,) = camera.project(rear[None], pose)
+            focal = camera.intrinsics[0, 0]
+            assert np.median(columns) == pytest.approx(foot[0], abs=0.35 * focal / depth)
+            assert rows.max() == pytest.approx(foot[1], abs=0.35 * focal / depth + 2)
+            assert np.ptp(columns) == pytest.approx(WIDTH_M * focal / depth, rel=0.4)
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_heavy_shadow_has_the_specified_contrast_and_coverage(lanes: int) -> None:
+    """At most 0.4 of the lit luminance, over 30 to 80 % of the road within 30 m."""
+    road = Road(find_track("forest"), lanes)
+    rng = np.random.default_rng(8)
+    with Camera(road, seed=7, light=light("heavy-shadow", 3)) as camera:
+        places = rng.uniform(0.0, road.track.length_m, 60)
+        poses = [standing_pose(road, s, 0.0) for s in places]
+        shares = [camera.shadow_fraction(pose) for pose in poses]
+        ratios = []
+        for pose in poses[:12]:
+            grey = camera.render(pose).astype(np.float64)[150:].mean(axis=2)
+            dark, bright = np.percentile(grey, [12, 88])
+            ratios.append(dark / bright)
+    assert min(shares) >= 0.3
+    assert max(shares) <= 0.8
+    # Display values; in light itself the ratio is the square of this.
+    assert np.median(ratios) < 0.45
+    assert np.median(np.square(ratios)) < 0.4
 
 
 def test_overcast_and_fog_cast_no_hard_shadows(road: Road) -> None:
@@ -142,6 +191,33 @@ def test_closed_cameras_free_their_memory(road: Road) -> None:
     for seed in range(10):
         draw_once(seed)
     assert resident_mb() - before < 8.0
+
+
+def test_invalid_sizes_and_fields_of_view_are_refused(road: Road) -> None:
+    with pytest.raises(UserError, match="picture size 0 x 210"):
+        Camera(road, CameraParameters(width=0), seed=1, light=light())
+    with pytest.raises(UserError, match="field of view"):
+        CameraParameters(fov_y_deg=180.0)
+
+
+def test_error_without_egl_names_the_packages_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    import moderngl
+
+    def refuse(**_: object) -> None:
+        raise ImportError("libEGL.so not loaded")
+
+    monkeypatch.setattr(moderngl, "create_context", refuse)
+    with pytest.raises(UserError, match="apt-get install libegl1 libgl1 libgl1-mesa-dri"):
+        camera_context.Graphics()
+
+
+def test_overlay_lines_coincide_with_the_markings(road: Road) -> None:
+    pose = standing_pose(road, 150.0, 0.0)
+    with Camera(road, seed=1, light=light()) as camera:
+        lines = marking_polylines(camera, road, (150.0, pose))
+    assert len(lines) == 3
+    left, middle, right = (line[np.argmax(line[:, 1])] for line in lines)
+    assert left[0] < middle[0] < right[0]
 
 
 def test_contact_sheet_size_and_refused_arguments(road: Road, tmp_path: Path) -> None:

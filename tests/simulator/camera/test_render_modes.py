@@ -41,6 +41,10 @@ def rays(camera: Camera, pose: FloatArray, view: str = "front") -> tuple[FloatAr
     return eye.place, ahead + u[None, :, None] * right - v[:, None, None] * up
 
 
+def test_class_names_and_their_order() -> None:
+    assert CLASSES == ("road", "marking", "car", "ground", "sky", "object")
+
+
 @pytest.mark.parametrize("lanes", [1, 3])
 def test_road_depth_equals_the_depth_of_the_track_surface(lanes: int) -> None:
     """The point that a road pixel shows, eye plus ray times depth, lies on the road plane."""
@@ -254,6 +258,17 @@ def test_calibration_matches_the_projection(road: Road, view: str) -> None:
     homogeneous = seen[ahead, :3] @ matrix.T
     assert homogeneous[:, :2] / homogeneous[:, 2:] == pytest.approx(pixels[ahead])
     assert ahead.sum() > 50
+
+
+@pytest.mark.parametrize("size", [(280, 210), (64, 48), (1920, 1080), (100, 300)])
+@pytest.mark.parametrize("fov", [20.0, 67.5, 120.0])
+def test_intrinsics_follow_size_and_field_of_view(size: tuple[int, int], fov: float) -> None:
+    width, height = size
+    matrix = CameraParameters(width, height, fov).intrinsics()
+    up, down = (np.arctan((v - matrix[1, 2]) / matrix[1, 1]) for v in (-0.5, height - 0.5))
+    assert np.degrees(down - up) == pytest.approx(fov)
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    assert (matrix[0, 2], matrix[1, 2], matrix[0, 0]) == (*centre, matrix[1, 1])
 
 
 def test_colourise_maps_depth_and_class_to_colours(road: Road) -> None:

@@ -49,8 +49,6 @@ def test_heavy_shadow_covers_30_to_80_percent_of_every_road(name: str) -> None:
         shadows = light("heavy-shadow", seed)
         with Camera(road, CameraParameters(8, 8), seed=seed, light=shadows) as camera:
             mask = camera._loaded.scene.mask
-            share = camera.shadow_fraction(standing_pose(road, 60.0, 0.0))
-            assert share == pytest.approx(mask.fraction(60.0, road.half_asphalt), abs=0.01)
         places = np.arange(0.0, road.track.length_m, 3.0)
         shares = [mask.fraction(float(s), road.half_asphalt) for s in places]
         assert min(shares) >= 0.3, (lanes, seed)

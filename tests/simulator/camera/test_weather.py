@@ -64,6 +64,13 @@ def detail_far_away(kind: str) -> float:
     return float(np.mean(found))
 
 
+def test_light_kinds_are_the_documented_ones() -> None:
+    assert KINDS == ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
+    assert WEATHERS == ("rain", "snow")
+    for kind in KINDS:
+        assert light(kind).weather == (kind if kind in WEATHERS else "")
+
+
 def test_snow_is_white_and_rain_is_dark_and_grey() -> None:
     assert ground("snow").mean() > 1.8 * ground("overcast").mean()
     asphalt = {kind: pictures(kind)[:, 180:, 110:170].mean() for kind in ("overcast", "rain")}

@@ -108,6 +108,19 @@ def test_the_papers_quadratic_reward() -> None:
     assert quadratic_reward(0.0, 0.0, 0.0, ended=True) == -2.0
 
 
+def test_leaving_the_track_ends_the_episode_with_minus_two() -> None:
+    env = make()
+    env.reset(seed=0, options={"s": 60.0, "speed": 15.0})
+    for _ in range(200):
+        _, reward, ended, _, info = env.step(steer(0.3))
+        if ended:
+            break
+    assert ended
+    assert reward == -2.0
+    assert info["ended"] == "off_track"
+    env.close()
+
+
 @pytest.mark.contacts
 def test_a_collision_ends_the_episode_with_minus_two() -> None:
     env = make(track="oval", traffic=1, controls="full")
@@ -158,6 +171,22 @@ def test_full_controls_shift_gears_and_brake() -> None:
     assert info["speed_kmh"] < 10.0
     assert env.unwrapped.world.state.gear == 2  # type: ignore[attr-defined]
     env.close()
+
+
+def test_a_vector_environment_equals_two_single_environments() -> None:
+    vector = gym.make_vec(STATE_ID, num_envs=2, vectorization_mode="async", track="circuit")
+    assert isinstance(vector, gym.vector.AsyncVectorEnv)
+    observations, _ = vector.reset(seed=[4, 5])
+    for _ in range(30):
+        observations, *_ = vector.step(np.array([[0.02], [-0.02]], np.float32))
+    vector.close()
+    for row, action in ((0, 0.02), (1, -0.02)):
+        env = make()
+        alone, _ = env.reset(seed=4 + row)
+        for _ in range(30):
+            alone, *_ = env.step(steer(action))
+        np.testing.assert_array_equal(observations[row], alone)
+        env.close()
 
 
 def test_start_options_at_their_bounds_and_of_other_kinds() -> None:
@@ -287,6 +316,8 @@ def test_a_step_without_an_episode_is_refused() -> None:
     "code",
     [
         "import gymnasium, simulator; print(gymnasium.spec('driverview/DriverView-v0').id)",
+        "import gymnasium as g; e = g.make('simulator.env:driverview/DriverView-v0', width=64);"
+        "print(e.spec.id)",
         "import gymnasium as g; e = g.make_vec('simulator.env:driverview/DriverView-v0', 2,"
         "vectorization_mode='sync'); print(e.spec.id)",
     ],
@@ -296,3 +327,16 @@ def test_environments_are_registered_by_import_or_by_module_prefix(code: str) ->
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.splitlines()[-1] == IMAGE_ID
+
+
+def test_driver_view_observes_image_and_state() -> None:
+    env = gym.make(IMAGE_ID, track="circuit", lanes=2, width=140, height=105)
+    try:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        assert observation["image"].shape == (105, 140, 3)
+        assert observation["image"].std() > 10.0  # not a blank image
+        moved, *_ = env.step(steer(0.0))
+        assert moved["state"].shape == (7,)
+    finally:
+        env.close()

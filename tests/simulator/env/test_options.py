@@ -227,6 +227,14 @@ def test_info_contains_only_features_that_are_present() -> None:
     env.close()
 
 
+def test_a_vector_environment_stacks_features_with_presence_masks() -> None:
+    vector = gym.make_vec(STATE_ID, 2, vectorization_mode="sync", track="oval", lanes=2)
+    _, infos = vector.reset(seed=0, options={"to_middle": 0.0})
+    np.testing.assert_array_equal(infos["features"]["_m"], [True, True])
+    np.testing.assert_array_equal(infos["features"].get("_ml", [False, False]), [False, False])
+    vector.close()
+
+
 @pytest.mark.parametrize("view", ["front", "chase"])
 def test_record_video_writes_every_frame(tmp_path: Path, view: str) -> None:
     env: gym.Env[Any, Any] = RecordVideo(

@@ -12,10 +12,8 @@ from simulator.env.vector import LateralControlVector
 from trackfeatures.errors import UserError
 
 ID = "driverview/LateralControl-v0"
-
-
 TRACKS = ("circuit", "oval", "mountain-pass", "town", "forest")
-CARS = 20
+CARS = 64
 LIST: dict[str, Any] = {
     "track": [TRACKS[k % 5] for k in range(CARS)],
     "lanes": [1 + k % 3 for k in range(CARS)],
@@ -38,6 +36,13 @@ def make_single(number: int, options: dict[str, Any], **shared: Any) -> gym.Env[
     return gym.make(ID, disable_env_checker=True, **own, **shared)
 
 
+def steering(observations: Any, errors: Any, rng: np.random.Generator) -> Any:
+    """Steer to the middle, with slow errors (N,) so large that some of the cars leave the road."""
+    errors[:] = 0.95 * errors + rng.normal(0.0, 0.12, len(errors))
+    wheel = 4.0 * observations[:, 1] - 0.9 * observations[:, 0] + errors
+    return np.clip(wheel, -1.0, 1.0).astype(np.float32)[:, None]
+
+
 def assert_equal(one: Any, other: Any, path: str = "") -> None:
     """Equal keys, types and bits, through all levels of dicts."""
     if isinstance(one, dict):
@@ -52,33 +57,66 @@ def assert_equal(one: Any, other: Any, path: str = "") -> None:
         np.testing.assert_array_equal(one, other, err_msg=path, strict=isinstance(one, np.ndarray))
 
 
+@pytest.mark.contacts
+@pytest.mark.parametrize(
+    ("steps", "longest"), [(120, 50), pytest.param(2000, 700, marks=pytest.mark.extended)]
+)
+def test_64_cars_on_five_tracks_equal_single_environments(steps: int, longest: int) -> None:
+    vector = make_vector(CARS, threads=3, max_episode_steps=longest, **LIST)
+    rng, errors = np.random.default_rng(1), np.linspace(-4.0, 4.0, CARS)
+    seeds = [100 + 7 * k for k in range(CARS)]
+    observations, _ = vector.reset(seed=seeds)
+    shown = np.zeros((steps + 1, CARS, 7), np.float32)
+    told = np.zeros((steps, CARS, 5))
+    actions = np.zeros((steps, CARS, 1), np.float32)
+    shown[0] = observations
+    for step in range(steps):
+        actions[step] = steering(shown[step], errors, rng)
+        shown[step + 1], *rest, info = vector.step(actions[step])
+        told[step] = np.column_stack((*rest, info["score"], info["s"]))
+    vector.close()
+    assert told[:, :, 1].sum() > 10  # episodes that ended,
+    assert told[:, :, 2].sum() > 60  # and that were cut off
+    for number in range(CARS):
+        env = make_single(number, LIST, max_episode_steps=longest)
+        observation, info = env.reset(seed=seeds[number])
+        heard: list[Any] = []
+        seen: list[Any] = [observation]
+        over: Any = False
+        for step in range(steps):
+            if over:
+                observation, info = env.reset()
+                heard.append((0.0, False, False, info["score"], info["s"]))
+            else:
+                observation, reward, ended, cut, info = env.step(actions[step, number])
+                heard.append((reward, ended, cut, info["score"], info["s"]))
+            over = heard[-1][1] or heard[-1][2]
+            seen.append(observation)
+        env.close()
+        np.testing.assert_array_equal(shown[:, number], seen, err_msg=f"car {number}")
+        np.testing.assert_array_equal(told[:, number], heard, err_msg=f"car {number}")
+
+
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize(
-    ("count", "shared"),
+    "shared",
     [
-        (CARS, {}),
-        (
-            5,
-            {
-                "noise": True,
-                "sensors": ("range", "v_x"),
-                "sensor_noise": {"v_x": 0.5, "range": 0.1},
-            },
-        ),
-        (5, {"sensors": ["range"], "controls": "full", "frequency_hz": 10}),
-        (5, {"ends": ("collision",), "reward": lambda state, road, ending: state.to_middle}),
+        {},
+        {"noise": True, "sensors": ("range", "v_x"), "sensor_noise": {"v_x": 0.5, "range": 0.1}},
+        {"sensors": ["range"], "controls": "full", "frequency_hz": 10},
+        {"ends": ("collision",), "reward": lambda state, road, ending: state.to_middle},
     ],
 )
 @pytest.mark.contacts
 def test_everything_equals_gymnasiums_vector_of_single_environments(
-    mode: AutoresetMode, count: int, shared: dict[str, Any]
+    mode: AutoresetMode, shared: dict[str, Any]
 ) -> None:
-    options = {"max_episode_steps": 40, **shared}
+    count, options = 5, {"max_episode_steps": 40, **shared}
     lists = {name: values[:count] for name, values in LIST.items()}
     expected = gym.vector.SyncVectorEnv(
         [partial(make_single, k, lists, **options) for k in range(count)], autoreset_mode=mode
     )
-    vector = make_vector(count, autoreset_mode=mode, threads=3, **lists, **options)
+    vector = make_vector(count, autoreset_mode=mode, threads=2, **lists, **options)
     assert vector.observation_space == expected.observation_space
     assert vector.action_space == expected.action_space
     assert vector.metadata == expected.metadata
@@ -101,6 +139,20 @@ def test_everything_equals_gymnasiums_vector_of_single_environments(
     assert ended > 5
     vector.close()
     expected.close()
+
+
+def test_threads_and_number_of_cars_change_nothing() -> None:
+    seen = []
+    for count, threads in ((6, 1), (6, 4), (4, 2)):
+        vector = make_vector(count, threads=threads, track="town", friction=(0.8, 1.0))
+        observations, _ = vector.reset(seed=5)
+        for step in range(40):
+            actions = np.linspace(-0.4, 0.4, 6)[:count, None] * np.cos(step)
+            observations, *_ = vector.step(actions)
+        seen.append(observations[:4])
+        vector.close()
+    np.testing.assert_array_equal(seen[0], seen[1])
+    np.testing.assert_array_equal(seen[0], seen[2])
 
 
 def test_ranges_and_random_roads_are_drawn_anew_in_each_episode() -> None:

@@ -62,6 +62,9 @@ process.run(process.LinkConfig(name=sys.argv[1], track="oval"), print)
     ("command", "said"),
     [
         (Command(steer=math.nan), "steer = nan"),
+        (Command(steer=1.01), r"steer = 1\.01"),
+        (Command(throttle=-0.1), r"throttle = -0\.1"),
+        (Command(brake=math.inf), "brake = inf"),
         (Command(gear=7), "gear = 7"),
     ],
 )
@@ -76,6 +79,14 @@ def test_a_bad_command_is_refused_and_the_car_is_unchanged(
         assert refusal.value.code == Refusal.BAD_COMMAND
         assert link.latest().state == before.state
         assert link.step(Command(throttle=0.5)).step == 2
+
+
+def test_values_beyond_a_bound_by_the_rounding_of_float32_are_clipped(oval: str) -> None:
+    with Link(oval, wait_s=WAIT_S) as link:
+        start = link.reset(seed=1, to_middle=link.info.edge + 1e-6, angle=0.1)
+        assert start.state.to_middle == pytest.approx(link.info.edge, abs=1e-9)
+        link.reset(seed=1)
+        assert link.step(Command(steer=1.0000001, throttle=-1e-7)).step == 1
 
 
 @pytest.mark.parametrize(
@@ -195,11 +206,12 @@ def test_quit_ends_the_server_and_prints_its_summary(name: str) -> None:
     ]
 
 
-def test_sigterm_notifies_the_client_and_prints_json(server: Start, name: str) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_sigterm_notifies_the_client_and_prints_json(server: Start, name: str, number: int) -> None:
     process = server("--track", "oval", "--json")
     with Link(name, wait_s=WAIT_S) as link:
         link.reset(seed=1)
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         out, said = process.communicate(timeout=WAIT_S)
         with pytest.raises(ServerDied, match="has ended"):
             link.step(Command())

@@ -173,6 +173,14 @@ def test_readings_are_clipped_to_the_limits() -> None:
     assert readings["wheel_spin_rear_left"] == pytest.approx(10.0 / 0.3273)
 
 
+def test_a_user_adds_a_sensor_in_one_line() -> None:
+    slip = Sensor("side_slip", "rad", lambda world: math.atan2(world.state.vy, world.state.vx))
+    suite = SensorSuite([*STANDARD, slip])
+    with World(Road(find_track("oval"))) as world:
+        world.reset(seed=0, speed=10.0)
+        assert suite.read(world)["side_slip"] == pytest.approx(0.0, abs=1e-12)
+
+
 def test_noise_is_off_by_default_seeded_and_of_the_size_asked_for() -> None:
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0, speed=10.0)

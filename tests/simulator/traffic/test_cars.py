@@ -1,10 +1,12 @@
-"""Traffic: speeds within their limits, determinism, placement; the audit finds collisions."""
+"""Traffic: no collisions, speeds within their limits, determinism, placement."""
 
+import itertools
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from simulator.track.geometry import Track
 from simulator.track.pieces import Piece
@@ -34,6 +36,25 @@ def stadium(straight: float = 300.0, radius: float = 40.0, hill: float = 6.0) ->
     return build(pieces, width=12.0)
 
 
+def corners(poses: NDArray[np.float64], size: tuple[float, ...]) -> NDArray[np.float64]:
+    """(n, 4, 2) corners of the boxes seen from above."""
+    half = 0.5 * np.array([size[0], size[1]])
+    local = half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+    cos, sin = np.cos(poses[:, 5]), np.sin(poses[:, 5])
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    placed: NDArray[np.float64] = poses[:, None, :2] + np.einsum("nij,kj->nki", turn, local)
+    return placed
+
+
+def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Separating-axis test of two convex quadrangles (4, 2)."""
+    edges = np.concatenate([np.diff(a[:3], axis=0), np.diff(b[:3], axis=0)])
+    normals = np.stack([-edges[:, 1], edges[:, 0]], -1)
+    on_a, on_b = normals @ a.T, normals @ b.T
+    gap = (on_a.max(1) < on_b.min(1)) | (on_b.max(1) < on_a.min(1))
+    return bool(gap.any())
+
+
 def run(lanes: int, seed: int, steps: int, ego_speed: float = 14.0) -> tuple[Traffic, list[Any]]:
     """Traffic with an ego car in the rightmost lane; returns samples of all positions."""
     road = Road(stadium(), lanes=lanes, lane_width=3.2)
@@ -48,6 +69,26 @@ def run(lanes: int, seed: int, steps: int, ego_speed: float = 14.0) -> tuple[Tra
         if step % 4 == 0:
             places.append((traffic.poses(), traffic.speed, traffic.to_middle, ego_s, ego_y))
     return traffic, places
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 3])
+def test_twelve_cars_never_touch_in_three_minutes(lanes: int) -> None:
+    traffic, places = run(lanes, seed=lanes, steps=3600)
+    track = traffic.road.track
+    moved = 0.0
+    for poses, speed, _, ego_s, ego_y in places:
+        at = track.at(ego_s, ego_y)
+        ego = np.array([[at.x, at.y, at.z, 0.0, 0.0, at.heading]], dtype=np.float64)
+        # Only near cars can touch: a cheap filter before the exact test.
+        boxes = np.concatenate([corners(poses, TRAFFIC_CAR_SIZE), corners(ego, EGO_CAR_SIZE)])
+        middles = boxes.mean(axis=1)
+        for i, j in itertools.combinations(range(13), 2):
+            if np.hypot(*(middles[i] - middles[j])) < 6.0:
+                assert apart(boxes[i], boxes[j]), f"cars {i} and {j} overlap"
+        moved += float(speed.mean()) * 4 * DT
+    changes = float(np.abs(np.diff([y for _, _, y, _, _ in places], axis=0)).sum())
+    assert moved > 180 * 5  # they do drive: more than 5 m/s on average
+    assert (changes > 3.0) == (lanes > 1)  # and change lanes where there are lanes
 
 
 def test_same_seed_is_bit_identical() -> None:
@@ -144,6 +185,12 @@ def test_leader_is_the_nearest_car_in_the_same_lane() -> None:
         assert found[1] == pytest.approx(traffic.speed[first])
     assert not traffic.has_room(float(traffic.s[first]), -2.0, 10.0)
     assert Traffic(road, 0, np.random.default_rng(0)).leader(0.0, 0.0) is None
+
+
+@pytest.mark.parametrize("count", [-1, 13, 500])
+def test_more_cars_than_fit_are_refused(count: int) -> None:
+    with pytest.raises(UserError, match="ask for fewer"):
+        Traffic(Road(stadium(), lanes=3), count, np.random.default_rng(0))
 
 
 def test_a_short_track_has_room_for_fewer_cars() -> None:

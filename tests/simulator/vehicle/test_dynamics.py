@@ -10,7 +10,7 @@ import pytest
 from simulator.track.pieces import Piece
 from simulator.track.road import Road
 from simulator.vehicle.car import GRAVITY, RPM, CarParameters
-from simulator.vehicle.dynamics import MEMORY, MOTION, PIECE, compute_forces
+from simulator.vehicle.dynamics import DT, MEMORY, MOTION, PIECE, compute_forces
 from simulator.vehicle.powertrain import clutch
 from simulator.vehicle.state import CarState, Command
 from simulator.vehicle.surface import SURFACES, VERGE, ground
@@ -210,6 +210,10 @@ def test_bad_car_parameters_are_refused() -> None:
         CarParameters(mass=-1.0)
     with pytest.raises(UserError, match="torque table has 2"):
         CarParameters(torque=(1.0, 2.0))
+
+
+def test_physics_step_is_five_milliseconds() -> None:
+    assert DT == 0.005
 
 
 def test_tyre_stiffness_matches_the_recorded_laps() -> None:

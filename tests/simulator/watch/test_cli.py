@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -90,6 +91,13 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
 )
 def test_errors_are_one_line(flags: tuple[str, ...], said: str) -> None:
     assert said in refusal(run(*flags))
+
+
+def test_error_for_a_port_in_use_is_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = refusal(run("--port", str(port)))
+    assert f"cannot listen on 127.0.0.1 port {port}: Address already in use" in said
 
 
 def test_error_without_a_renderer_is_one_line() -> None:

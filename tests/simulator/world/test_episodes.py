@@ -52,9 +52,13 @@ def test_the_same_seed_in_two_processes_is_bit_identical() -> None:
     code = (
         "import tests.simulator.world.test_episodes as t; print(t.fingerprint(5, rehearse=False))"
     )
-    command = [sys.executable, "-c", code]
-    there = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert there.stdout.strip() == here
+    there = [
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for _ in range(2)
+    ]
+    assert there == [here, here]
 
 
 def test_the_start_is_25_m_before_the_line_and_crossing_it_adds_a_lap() -> None:
@@ -102,6 +106,22 @@ def test_features_match_the_cars_position() -> None:
 
 
 @pytest.mark.contacts
+def test_a_wall_stops_the_car_and_is_recorded() -> None:
+    with World(stadium()) as world:
+        state = world.reset(seed=0, s=100.0, angle=-0.5, speed=20.0)
+        hits = []
+        for _ in range(40):
+            state = world.step(Command(gear=0))
+            hits.append(state.collision)
+            assert state.to_middle < world.road.wall_offset
+        assert "wall" in hits
+        assert hits[0] is None
+        assert state.speed < 17.0
+        assert math.isfinite(state.roll)
+        assert abs(state.roll) < 0.3
+
+
+@pytest.mark.contacts
 def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
     with World(stadium()) as world:
         for angle in (-0.1, -0.7, -1.4):
@@ -111,6 +131,25 @@ def test_a_car_has_left_the_track_before_it_meets_the_wall() -> None:
             hits = [i for i, state in enumerate(seen) if state.collision]
             assert not hits or off <= hits[0]  # both may integrate into one control step
             assert world.road.edge < seen[off].to_middle < world.road.edge + 0.8
+
+
+@pytest.mark.contacts
+def test_a_collision_with_traffic_is_recorded_and_slows_the_car() -> None:
+    with World(stadium(lanes=1), traffic=1) as world:
+        world.reset(seed=3)
+        gap_s = float(world.traffic.s[0]) - 30.0
+        # Traffic starts clear of the ego car, so the ego car starts behind its later place.
+        state = world.reset(seed=3, s=gap_s - 60.0, speed=0.0)
+        before, hit = state, None
+        for _ in range(1200):
+            after = world.step(follow(state, 0.45))
+            before, state = state, after
+            if state.collision is not None:
+                hit = state
+                break
+        assert hit is not None
+        assert hit.collision == "traffic"
+        assert hit.speed < before.speed - 0.5
 
 
 def test_driving_backwards_is_reported() -> None:

@@ -14,8 +14,8 @@ from trackfeatures.errors import UserError
 NAN, INF = math.nan, math.inf
 
 
-def road() -> Road:
-    return Road(find_track("oval"), 1)
+def road(lanes: int = 1) -> Road:
+    return Road(find_track("oval"), lanes)
 
 
 @pytest.mark.parametrize("frequency", [0, -20, 30, 400, 0.5, 20.5, NAN])
@@ -24,14 +24,28 @@ def test_bad_control_rates_are_refused(frequency: Any) -> None:
         World(road(), frequency_hz=frequency)
 
 
-@pytest.mark.parametrize(
-    ("counts", "message"),
-    [((-1, 13, 10_000), "takes 0 to 12; ask for"), ((2.5, "3", None, True), "give a whole number")],
-)
-def test_bad_traffic_counts_are_refused(counts: tuple[Any, ...], message: str) -> None:
-    for count in counts:
-        with pytest.raises(UserError, match=message):
-            World(road(), traffic=count)
+@pytest.mark.parametrize("count", [-1, 13, 10_000])
+def test_bad_traffic_counts_are_refused(count: int) -> None:
+    with pytest.raises(UserError, match=r"takes 0 to 12; ask for fewer"):
+        World(road(), traffic=count)
+
+
+@pytest.mark.parametrize("count", [2.5, "3", None, True])
+def test_traffic_counts_that_are_not_integers_are_refused(count: Any) -> None:
+    with pytest.raises(UserError, match="give a whole number"):
+        World(road(), traffic=count)
+
+
+@pytest.mark.parametrize("lanes", [0, -1, 4, 100])
+def test_bad_lane_counts_are_refused(lanes: int) -> None:
+    with pytest.raises(UserError, match="lane"):
+        road(lanes)
+
+
+@pytest.mark.parametrize("width", [0.0, 2.6, 4.6, NAN])
+def test_bad_lane_widths_are_refused(width: float) -> None:
+    with pytest.raises(UserError, match="lane"):
+        Road(find_track("oval"), 1, width)
 
 
 @pytest.mark.parametrize(

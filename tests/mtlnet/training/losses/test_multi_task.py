@@ -13,7 +13,7 @@ from mtlnet.training.losses.alpha import AlphaError, parse_alpha
 from mtlnet.training.losses.bins import bins_loss
 from mtlnet.training.losses.multi_task import Terms, multi_task_loss
 from mtlnet.training.losses.task_weighting import TaskWeighting
-from mtlnet.training.recipes import HuberLoss
+from mtlnet.training.recipes import RECIPES, HuberLoss
 
 OUTPUTS = torch.tensor(
     [
@@ -61,6 +61,12 @@ def test_huber_losses_equal_those_by_hand() -> None:
     squared = multi_task_loss(OUTPUTS, TARGETS, HEADING, by_alpha(1.0, 2.0, 0.0), scale, huber)
     assert float(squared.total) == pytest.approx(2.5 * 2 / 10 / 4 + 2 * angle)
     assert float(linear.distance) == pytest.approx(DISTANCE)
+
+
+def test_the_recipe_holds_the_gains_of_the_loss() -> None:
+    assert RECIPES["fast"].huber == HuberLoss(0.05, 1.0, 2.5, 5.0)
+    assert RECIPES["tune"].huber == RECIPES["fast"].huber
+    assert RECIPES["paper"].huber is None
 
 
 def test_between_two_values_the_huber_loss_is_least_at_the_likelier() -> None:

@@ -4,8 +4,10 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -206,6 +208,13 @@ def test_a_bad_name_is_one_clear_line(name: str) -> None:
     assert repr(name) in said
     assert "random:SEED with a whole number from 0 to" in said
     assert "\n" not in said
+
+
+def test_an_environment_drives_on_a_random_road() -> None:
+    with closing(gym.make("simulator.env:driverview/LateralControl-v0", track="random:7")) as env:
+        env.reset(seed=1)
+        rewards = [float(env.step(np.zeros(1, np.float32))[1]) for _ in range(20)]
+    assert min(rewards) > 0.8
 
 
 @pytest.mark.alone
