@@ -224,7 +224,6 @@ def worst_figures(
         image = draw_overlay(
             frames.image(row),
             view,
-            view.height_above_road_m,
             float(labels.curvature[row]),
             (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[row])),
             (prediction.distances_m, prediction.angle_rad),

@@ -183,7 +183,6 @@ def draw_prediction(
     picture = draw_overlay(
         item.image,
         camera,
-        camera.height_above_road_m,
         truth.curvature if truth else 0.0,
         (truth.distances_m, truth.angle_rad) if truth else ({}, 0.0),
         (prediction.distances_m, prediction.angle_rad),
