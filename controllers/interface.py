@@ -93,6 +93,9 @@ class BatchController(Controller, Protocol):
     A controller object steers either one car by `update`, or the same N cars by `update_batch`.
     """
 
+    def update(self, observation: Observation) -> float:
+        return float(self.update_batch(Observations.of(observation))[0])
+
     def update_batch(self, observations: Observations) -> NDArray[np.float64]:
         """The steering actions (N,) of all cars; called once for each control step.
 

@@ -6,7 +6,9 @@ import pytest
 from mtlnet.inference.overlay import SCALE, draw_overlay, marking_line, to_pixels
 from trackfeatures.camera import CameraParameters
 
-CAMERA = CameraParameters(width=200, height=100, fov_y_deg=90.0, x=0.0, y=0.0, z=0.75, pitch_deg=0.0)
+CAMERA = CameraParameters(
+    width=200, height=100, fov_y_deg=90.0, x=0.0, y=0.0, z=0.75, pitch_deg=0.0
+)
 NOTHING = dict.fromkeys(("ml", "mr", "l", "m", "r"))
 
 
