@@ -157,12 +157,7 @@ def evaluate_command(
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
     engines = [_load(model, engine, precision, gpu=True) for _ in range(os.cpu_count() or 1)]
-    with command.progress_bar() as bar:
-        task = bar.add_task("evaluating", total=None)
-
-        def report(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with command.progress("evaluating") as report:
         if protocol:
             result = evaluate_protocol(engines, data, protocol, report, every)
         else:
@@ -243,11 +238,8 @@ def calibrate_command(config: CalibrateConfig, as_json: command.AsJson = False) 
     lens)."""
     from mtlnet.calibration.run import calibrate
 
-    with command.progress_bar() as bar:
-        task = bar.add_task("calibrating", total=None)
-        result, line = calibrate(
-            config, lambda done, total: bar.update(task, completed=int(done), total=int(total))
-        )
+    with command.progress("calibrating") as report:
+        result, line = calibrate(config, report)
     command.print_result(result, as_json, f"{config.out}: {line}")
 
 

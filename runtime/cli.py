@@ -9,7 +9,8 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -63,6 +64,21 @@ def progress_bar() -> "Progress":
 
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+@contextmanager
+def progress(text: str = "") -> Iterator[Callable[..., None]]:
+    """Show a progress bar with `text`; yields a function of the numbers done and in total and, if
+    it changes, the text."""
+    from rich.markup import escape
+
+    with progress_bar() as bar:
+        task = bar.add_task(escape(text), total=None)
+
+        def report(done: float, total: float, text: str = text) -> None:
+            bar.update(task, completed=done, total=total, description=escape(text))
+
+        yield report
 
 
 def printable(text: str) -> str:
