@@ -44,13 +44,6 @@ class SteeringLaw(Protocol):
         ...
 
 
-class _ScriptedLaw(LateralLaw):
-    """The default law. It has no state, so a restart changes nothing."""
-
-    def restart(self) -> None:
-        """Do nothing."""
-
-
 class ScriptedDriver:
     """The driver of one round. Deterministic: everything random is in the course."""
 
@@ -60,17 +53,16 @@ class ScriptedDriver:
         course: Course,
         speed: float,
         frequency_hz: int = 20,
-        car: CarParameters | None = None,
         *,
         law: SteeringLaw | None = None,
     ) -> None:
         """`speed` in m/s, where road and traffic allow it. `law` replaces the default law."""
-        car = car or CarParameters()
+        car = CarParameters()
         self._road = road
         self._course = course
         self._dt = 1.0 / frequency_hz
         self._max_offset = max_offset(road)
-        self._law = law or _ScriptedLaw(
+        self._law = law or LateralLaw(
             car, road, natural_frequency=NATURAL_FREQUENCY, damping=DAMPING
         )
         self._profile = speed_profile(road.track, speed, self._max_offset)
@@ -93,11 +85,6 @@ class ScriptedDriver:
     def speed_at(self, s: float) -> float:
         """Target speed (m/s) at `s` (m)."""
         return self._profile.at(s)
-
-    @property
-    def target_offset(self) -> float:
-        """Target offset (m) of the last command."""
-        return self._steered_for or 0.0
 
     def command(self, state: CarState, traffic: Traffic, driven_m: float) -> Command:
         """The command for one control step; `driven_m` counts from the start of the round and
