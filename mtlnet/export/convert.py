@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from datagen.recording import Dataset
 from mtlnet.architecture import HEIGHT, WIDTH
-from mtlnet.data.custom_images import LABELS, has_labels_file
+from mtlnet.data.custom_images import has_labels_file
+from mtlnet.data.labels_file import LABELS
 from mtlnet.data.rounds import hold_out_rounds
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (

@@ -1,15 +1,23 @@
-"""The options of `simulator watch`.
+"""The command `simulator watch`: drives and serves until Ctrl-C.
 
 simulator watch --track coast --lanes 2 --traffic 6 --light overcast --port 8765
 """
 
+import signal
+import socket
+import sys
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 from typer import Option
 
 from runtime.options import options_of
 from simulator.track.cli import Lanes, TracksDir, Traffic
+
+if TYPE_CHECKING:
+    from simulator.track.road import Road
+
+FREQUENCY_HZ: Final = 20
 
 
 @dataclass(frozen=True)
@@ -36,6 +44,43 @@ def watch(config: WatchConfig) -> None:
     Shows several camera views, the plan of the track and the sensors. The first line on stderr is
     the address; this machine needs no display. Ctrl-C ends it.
     """
-    from simulator.watch.command import watch as run
+    from runtime.sockets import bind
+    from simulator.camera import check_light
+    from simulator.camera.core.context import graphics
+    from simulator.track.catalogue import find_track
+    from simulator.track.road import Road
+    from simulator.world.pace import check_speed
 
-    run(config)
+    road = Road(find_track(config.track, config.tracks_dir), config.lanes)
+    check_light(config.light)
+    check_speed(config.speed)
+    with bind(config.host, config.port) as listener:
+        listener.listen()
+        graphics()
+        _drive(road, config, listener)
+
+
+def _drive(road: "Road", config: WatchConfig, listener: socket.socket) -> None:
+    from runtime.signals import interrupts
+    from runtime.sockets import address
+    from simulator.watch.drive import Drive
+    from simulator.watch.hub import Hub
+    from simulator.watch.server import Server
+    from simulator.world.world import World
+
+    hub = Hub()
+    with World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ) as world:
+        drive = Drive(world, hub, light=config.light, seed=config.seed, speed=config.speed)
+        server = Server(hub, listener)
+        try:
+            server.start()
+            url = address(listener, config.host)
+            sys.stderr.write(f"watch {road.track.name} at {url} (Ctrl-C ends it)\n")
+            sys.stderr.flush()
+            with interrupts(signal.SIGINT) as interrupted:
+                while not interrupted():
+                    drive.advance()
+        finally:
+            server.stop()
+            drive.close()
+    raise KeyboardInterrupt

@@ -21,7 +21,8 @@ from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.index import open_round
 from mtlnet.calibration.config import CalibrateConfig
 from mtlnet.calibration.run import calibrate
-from mtlnet.data.custom_images import COLUMNS, open_custom_images
+from mtlnet.data.custom_images import open_custom_images
+from mtlnet.data.labels_file import COLUMNS
 from mtlnet.evaluation.protocol import drive_rows
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import crop_and_resize, read_header, read_whole_image
