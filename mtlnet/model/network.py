@@ -183,8 +183,8 @@ class SamePad(nn.Module):
 
     def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
         super().__init__()
-        self.out_height, top, bottom = same_padding(height, layer.kernel, layer.stride)
-        self.out_width, left, right = same_padding(width, layer.kernel, layer.stride)
+        _, top, bottom = same_padding(height, layer.kernel, layer.stride)
+        _, left, right = same_padding(width, layer.kernel, layer.stride)
         self.pads = (left, right, top, bottom)
 
     def forward(self, x: Tensor) -> Tensor:
