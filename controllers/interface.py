@@ -84,7 +84,6 @@ class Controller(Protocol):
 
     def update(self, observation: Observation) -> float:
         """The steering action in [-1, 1], left positive; called once for each control step."""
-        ...
 
 
 class BatchController(Controller, Protocol):
@@ -102,7 +101,6 @@ class BatchController(Controller, Protocol):
         Car k must get the action that an `update` of a controller of its own returns. A car whose
         drive is over keeps its last observation; its action is ignored.
         """
-        ...
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,9 @@ class FeatureModel(Protocol):
 
     def predict(self, image: Image) -> dict[str, Any]:
         """The prediction for an image (H, W, 3) RGB, in the format of the service's answers."""
-        ...
 
     def close(self) -> None:
         """Release what the model holds open."""
-        ...
 
 
 def truth(lane_centre: float) -> Perceive:

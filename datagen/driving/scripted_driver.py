@@ -31,17 +31,14 @@ class SteeringLaw(Protocol):
 
     def road_curvature(self, state: CarState) -> float:
         """Curvature (1/m) of the car's path along the road just ahead."""
-        ...
 
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
         """The steering action in [-1, 1] towards a path, as `LateralLaw.steer`."""
-        ...
 
     def restart(self) -> None:
         """Forget the past: the car was put back onto the road."""
-        ...
 
 
 class ScriptedDriver:
