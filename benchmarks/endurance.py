@@ -37,7 +37,7 @@ from benchmarks.claims.outcome import conclude, run_command
 from benchmarks.service_load.malicious_clients import malicious_clients
 from benchmarks.service_load.servers import OURS, descendants, running
 from mtlnet.inference.engine import load_engine
-from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.image_decoding.decode import crop_and_resize, decode_whole, read_header
 from mtlnet.inference.model_card import read_card
 from mtlnet.inference.prediction import decode_outputs
 from serve.client import Client, ServiceError
@@ -167,7 +167,9 @@ def expected_answers(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
     engine = load_engine(run)
     camera = engine.card.camera
     return [
-        decode_outputs(engine(decode(image, inspect(image, camera), camera))).as_json()
+        decode_outputs(
+            engine(crop_and_resize(decode_whole(image, read_header(image)), camera))
+        ).as_json()
         for image in images
     ]
 

@@ -33,7 +33,7 @@ def plain(engine: FakeEngine) -> Any:
     """The handler that one writes first."""
     from fastapi import FastAPI, Request
 
-    from mtlnet.inference.image_decoding.decode import decode, inspect
+    from mtlnet.inference.image_decoding.decode import crop_and_resize, decode_whole, read_header
     from mtlnet.inference.prediction import decode_outputs
 
     app = FastAPI()
@@ -42,9 +42,9 @@ def plain(engine: FakeEngine) -> Any:
     @app.post("/features")
     async def features(request: Request) -> dict[str, Any]:
         body = await request.body()
-        header = inspect(body, camera)  # ours does this before its clock starts, too
+        header = read_header(body)  # ours does this before its clock starts, too
         start = time.perf_counter()
-        answer = decode_outputs(engine(decode(body, header, camera)))
+        answer = decode_outputs(engine(crop_and_resize(decode_whole(body, header), camera)))
         work_ms = 1e3 * (time.perf_counter() - start)
         timing = {"decode": work_ms, "forward": 0.0}
         return {**answer.as_json(), "model": engine.card.model_hash, "timing_ms": timing}

@@ -84,7 +84,6 @@ class Controller(Protocol):
 
     def update(self, observation: Observation) -> float:
         """The steering action in [-1, 1], left positive; called once for each control step."""
-        ...
 
 
 class BatchController(Controller, Protocol):
@@ -93,13 +92,15 @@ class BatchController(Controller, Protocol):
     A controller object steers either one car by `update`, or the same N cars by `update_batch`.
     """
 
+    def update(self, observation: Observation) -> float:
+        return float(self.update_batch(Observations.of(observation))[0])
+
     def update_batch(self, observations: Observations) -> NDArray[np.float64]:
         """The steering actions (N,) of all cars; called once for each control step.
 
         Car k must get the action that an `update` of a controller of its own returns. A car whose
         drive is over keeps its last observation; its action is ignored.
         """
-        ...
 
 
 @dataclass(frozen=True)

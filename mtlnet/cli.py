@@ -13,6 +13,7 @@ from mtlnet.calibration.config import CalibrateConfig
 from mtlnet.training.config import TrainConfig
 from runtime import cli as command
 from runtime.options import options_of
+from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     from mtlnet.inference.engine import Engine
@@ -139,14 +140,11 @@ def evaluate_command(
 ) -> None:
     """Evaluate a model on a dataset: its errors in m and rad beside the errors of always predicting
     the training mean."""
-    import os
-
     from rich.console import Console
 
     from mtlnet.evaluation.evaluate import evaluate
     from mtlnet.evaluation.protocol import evaluate_protocol
     from mtlnet.evaluation.tables import report_tables
-    from trackfeatures.errors import UserError
 
     if protocol and (page is not None or worst is not None or copies or split != "test"):
         raise UserError(
@@ -157,12 +155,7 @@ def evaluate_command(
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
     engines = [_load(model, engine, precision, gpu=True) for _ in range(os.cpu_count() or 1)]
-    with command.progress_bar() as bar:
-        task = bar.add_task("evaluating", total=None)
-
-        def report(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with command.progress("evaluating") as report:
         if protocol:
             result = evaluate_protocol(engines, data, protocol, report, every)
         else:
@@ -197,7 +190,6 @@ def predict_command(
     from mtlnet.inference.rectification import Rectification, read_camera
     from mtlnet.predict.run import InputsLeftOut, predict_files
     from mtlnet.sources.pictures import Lens
-    from trackfeatures.errors import UserError
 
     own = str(camera) == "model"
     if camera is not None and fov_y_deg is not None and not own:
@@ -243,11 +235,8 @@ def calibrate_command(config: CalibrateConfig, as_json: command.AsJson = False) 
     lens)."""
     from mtlnet.calibration.run import calibrate
 
-    with command.progress_bar() as bar:
-        task = bar.add_task("calibrating", total=None)
-        result, line = calibrate(
-            config, lambda done, total: bar.update(task, completed=int(done), total=int(total))
-        )
+    with command.progress("calibrating") as report:
+        result, line = calibrate(config, report)
     command.print_result(result, as_json, f"{config.out}: {line}")
 
 
@@ -272,7 +261,6 @@ def label_command(
     """
     from mtlnet.label.import_table import import_labels, parse_label_std
     from runtime.access import check_exposure, read_token
-    from trackfeatures.errors import UserError
 
     if table is not None:
         found = import_labels(table, folder, parse_label_std(label_std or ()))

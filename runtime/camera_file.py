@@ -42,6 +42,7 @@ MODELS = {
     "equidistant": "fisheye",
     "equi": "fisheye",
     "fisheye": "fisheye",
+    "kannala_brandt": "fisheye",
 }
 """Names of distortion models in files, with our names."""
 MAX_SKEW = 1e-3  # as a fraction of the focal length
@@ -164,7 +165,7 @@ def _opencv(content: dict[str, Any]) -> dict[str, Any]:
         "width": width,
         "height": height,
         "matrix": (fx, fy, cx, cy),
-        **_distortion(model, _numbers(name, content[name])),
+        **read_distortion(model, _numbers(name, content[name])),
         **_plain(content, MOUNT),
     }
 
@@ -185,7 +186,7 @@ def _kalibr(content: dict[str, Any], name: str) -> dict[str, Any]:
         "width": size[0],
         "height": size[1],
         "matrix": tuple(_numbers("intrinsics", camera["intrinsics"])),
-        **_distortion(
+        **read_distortion(
             camera.get("distortion_model"),
             _numbers("distortion_coeffs", camera["distortion_coeffs"]),
         ),
@@ -193,7 +194,8 @@ def _kalibr(content: dict[str, Any], name: str) -> dict[str, Any]:
     }
 
 
-def _distortion(model: Any, given: list[float]) -> dict[str, Any]:
+def read_distortion(model: Any, given: list[float]) -> dict[str, Any]:
+    """The fields of `CameraParameters` for a lens model by any of its names. Raises CameraError."""
     if not isinstance(model, str) or model.lower() not in MODELS:
         known = ", ".join(MODELS)
         raise CameraError(f"the distortion model is {model!r}; known models are {known}")

@@ -9,11 +9,9 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable
-from dataclasses import fields
-from functools import partial, wraps
-from inspect import Parameter, Signature, signature
-from typing import TYPE_CHECKING, Annotated, Any, get_origin
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,33 +24,6 @@ FAILED = 1  # exit code for a UserError or OSError; Typer exits with 2 for a wro
 INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-
-
-def options(config: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a Typer command of a function whose first parameter is a `partial` of `config`.
-
-    The annotated fields of the dataclass `config` become options with their names and defaults, in
-    front of the function's other parameters: each option is declared once, in the dataclass. The
-    function calls the `partial`, with the values of the fields that are no options.
-    """
-    declared = [one for one in fields(config) if get_origin(one.type) is Annotated]
-
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        @wraps(function)
-        def command(**given: Any) -> None:
-            values = {one.name: given.pop(one.name) for one in declared}
-            function(partial(config, **values), **given)
-
-        made = [
-            Parameter(one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=one.type)
-            for one in declared
-        ]
-        _, *others = signature(function).parameters.values()
-        others = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in others]
-        command.__signature__ = Signature([*made, *others])  # type: ignore[attr-defined]
-        return command
-
-    return decorate
 
 
 def main(app: Callable[[], object]) -> None:
@@ -93,6 +64,21 @@ def progress_bar() -> "Progress":
 
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+@contextmanager
+def progress(text: str = "") -> Iterator[Callable[..., None]]:
+    """Show a progress bar with `text`; yields a function of the numbers done and in total and, if
+    it changes, the text."""
+    from rich.markup import escape
+
+    with progress_bar() as bar:
+        task = bar.add_task(escape(text), total=None)
+
+        def report(done: float, total: float, text: str = text) -> None:
+            bar.update(task, completed=done, total=total, description=escape(text))
+
+        yield report
 
 
 def printable(text: str) -> str:

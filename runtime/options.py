@@ -13,12 +13,14 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 Command = Callable[..., None]
 
 
-def options_of(config: Any, *, only_given: bool = False) -> Callable[[Command], Command]:
+def options_of(
+    config: Any, *, make: Callable[..., Any] | None = None, only_given: bool = False
+) -> Callable[[Command], Command]:
     """Add the options of the dataclass `config` to a command, which takes a `config` first.
 
-    With `only_given` the command takes a dictionary instead: field names and values of the options
-    that the user gave. The command finds the other values elsewhere; the help shows the dataclass's
-    defaults.
+    `make` makes that first argument of the options' values; a command that computes other fields
+    itself takes a `dict`. With `only_given` the dictionary has only the options that the user gave.
+    The command finds the other values elsewhere; the help shows the dataclass's defaults.
     """
     types = get_type_hints(config, include_extras=True)
     added = [
@@ -37,7 +39,7 @@ def options_of(config: Any, *, only_given: bool = False) -> Callable[[Command], 
                 given = {name: v for name, v in values.items() if v is not None and v is not False}
                 command(given, **own)
             else:
-                command(config(**values), **own)
+                command((make or config)(**values), **own)
 
         parameters = [*added, *(o.replace(kind=Parameter.KEYWORD_ONLY) for o in others)]
         run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # read by Typer

@@ -154,7 +154,7 @@ def reliability_diagram(title: str, predicted: FloatArray, observed: FloatArray)
 
 def _path(x_axis: Axis, y_axis: Axis, line: Line) -> str:
     points = _points(x_axis, y_axis, line.x, line.y)
-    return "".join("M" + "L".join(points[run]) for run in _runs(np.isfinite(line.y)))
+    return "".join("M" + "L".join(points[run]) for run in runs(np.isfinite(line.y)))
 
 
 def _band(x_axis: Axis, y_axis: Axis, line: Line) -> str:
@@ -162,7 +162,7 @@ def _band(x_axis: Axis, y_axis: Axis, line: Line) -> str:
     first, last = sorted((y_axis.first, y_axis.last))
     edges = [edge.clip(first, last) for edge in line.band]
     low, high = (_points(x_axis, y_axis, line.x, edge) for edge in edges)
-    rings = (high[run] + low[run][::-1] for run in _runs(np.isfinite(sum(edges))))
+    rings = (high[run] + low[run][::-1] for run in runs(np.isfinite(sum(edges))))
     path = "".join(f"M{'L'.join(ring)}Z" for ring in rings)
     return f'<path class=band{_colour("fill", line)} d="{path}"/>'
 
@@ -171,8 +171,8 @@ def _points(x_axis: Axis, y_axis: Axis, x: FloatArray, y: FloatArray) -> list[st
     return [f"{a:.1f},{b:.1f}" for a, b in zip(x_axis(x), y_axis(y), strict=True)]
 
 
-def _runs(present: NDArray[np.bool_]) -> list[slice]:
-    """The parts of a line between its gaps, where `present` (N,) is true."""
+def runs(present: NDArray[np.bool_]) -> list[slice]:
+    """The parts between the gaps of a line, where `present` (N,) is true."""
     edges = np.flatnonzero(np.diff(present, prepend=False, append=False))
     return [slice(a, b) for a, b in edges.reshape(-1, 2).tolist()]
 

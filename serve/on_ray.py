@@ -24,6 +24,7 @@ from mtlnet.inference.engine import load_engine
 from mtlnet.inference.model_card import resolve_run
 from runtime.access import read_token
 from runtime.cli import counted
+from runtime.sockets import url
 from serve.app import Service
 from serve.config import Limits, ServiceConfig
 from serve.observability import telemetry
@@ -94,9 +95,10 @@ def run(config: RayConfig) -> None:
     try:
         ray_serve.start(http_options={"host": config.host, "port": config.port})
         ray_serve.run(_bind(folder, config.replicas, config.limits), name=NAME)
-        host = f"[{config.host}]" if ":" in config.host else config.host
         replicas = counted(config.replicas, "replica")
-        sys.stderr.write(f"serving {folder} on Ray at http://{host}:{config.port}, {replicas}\n")
+        sys.stderr.write(
+            f"serving {folder} on Ray at {url(config.host, config.port)}, {replicas}\n"
+        )
         sys.stderr.flush()
         _wait_for_signal()
         ray_serve.delete(NAME)

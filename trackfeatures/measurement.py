@@ -37,7 +37,6 @@ class CentreLine(Protocol):
 
     def project(self, x: float, y: float) -> tuple[float, float]:
         """Arc length `s` and lateral distance `to_middle` of a point, both in m."""
-        ...
 
     def heading(self, s: float) -> float: ...
 

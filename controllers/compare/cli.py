@@ -19,19 +19,11 @@ def compare(config: CompareConfig, as_json: bool) -> None:
     The cars drive on one lane, from a standing start, with throttle 0.2 in gear 1. The same command
     continues an interrupted comparison: it skips the drives whose results are in the folder.
     """
-    from rich.markup import escape
-
     from controllers.compare.report import write_report
     from controllers.compare.run import compare as run
 
-    with command.progress_bar() as bar:
-        task = bar.add_task("", total=None)
-        content = run(
-            config,
-            lambda done, total, name: bar.update(
-                task, completed=done, total=total, description=escape(name)
-            ),
-        )
+    with command.progress() as progress:
+        content = run(config, progress)
     report = write_report(config.out, content)
     if as_json:
         typer.echo(json.dumps(content))
@@ -47,18 +39,10 @@ def tune(config: TuneConfig, as_json: bool) -> None:
     `controllers drive` and `controllers compare` read the file with --parameters. The same command
     continues an interrupted search.
     """
-    from rich.markup import escape
-
     from controllers.compare.tune import tune as run
 
-    with command.progress_bar() as bar:
-        task = bar.add_task("", total=None)
-        content = run(
-            config,
-            lambda done, total, name: bar.update(
-                task, completed=done, total=total, description=escape(name)
-            ),
-        )
+    with command.progress() as progress:
+        content = run(config, progress)
     if as_json:
         typer.echo(json.dumps(content))
         return

@@ -177,12 +177,11 @@ def _pair(true: float | None, predicted: float | None, digits: int) -> str:
 
 def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[dict[str, str]]:
     """The frames with their captions; true and predicted markings are drawn on them."""
-    height_m = camera.height_above_road_m
     for one in frames:
         image = simplejpeg.decode_jpeg(one.jpeg)
         prediction = (one.answer["distances_m"], one.answer["angle_rad"])
         truth = (one.distances, one.angle)
-        drawn = draw_overlay(image, camera, height_m, one.curvature, truth, prediction)
+        drawn = draw_overlay(image, camera, one.curvature, truth, prediction)
         lanes = f"{one.lanes} lane{'s' if one.lanes > 1 else ''}"
         yield {"jpeg": embed_jpeg(drawn), "caption": f"{one.track}, {lanes}, {one.round_id}"}
 

@@ -108,8 +108,7 @@ def run_demo(config: DemoConfig) -> DemoResult:
     _step(result, "train", train)
     result.evaluation = json.loads(_step(result, "evaluate", evaluate))
     _use_service(config, result)
-    text = json.dumps(result.as_json(), indent=1)
-    (config.out / "result.json").write_text(text + "\n")
+    write_json(config.out / "result.json", result.as_json())
     return result
 
 

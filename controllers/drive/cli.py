@@ -25,14 +25,12 @@ def drive(config: DriveConfig, as_json: bool) -> None:
     the car leaves the track, turns round, rolls backwards or collides.
     """
     from rich.console import Console
-    from rich.markup import escape
 
     from controllers.drive.run import check_started
     from controllers.drive.run import drive as run
 
-    with command.progress_bar() as bar:
-        task = bar.add_task(escape(f"{config.controller} on {config.track}"), total=None)
-        result = run(config, lambda done, total: bar.update(task, completed=done, total=total))
+    with command.progress(f"{config.controller} on {config.track}") as report:
+        result = run(config, report)
     check_started(config, result)
     if result.slowed_steps:
         Console(stderr=True).print(

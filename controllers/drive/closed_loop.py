@@ -62,13 +62,11 @@ class Pedals(Protocol):
     @property
     def mean_error(self) -> float | None:
         """Mean distance (m/s) from the set-point; None without a set-point."""
-        ...
 
     def __call__(
         self, now: CarState, traffic: Traffic, perceived: Perceived
     ) -> tuple[float, float, int]:
         """Throttle (0 to 1), brake (0 to 1) and gear for the present control step."""
-        ...
 
 
 @dataclass(frozen=True)

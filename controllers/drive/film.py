@@ -67,9 +67,7 @@ class DriveFilm:
         else:
             image, found = self._perception.image, self._perception.answer
             answer = (found["distances_m"], float(found["angle_rad"]))
-        parameters = self._camera.parameters
-        height = parameters.height_above_road_m
-        view = draw_overlay(image, parameters, height, now.curvature, truth, answer)
+        view = draw_overlay(image, self._camera.parameters, now.curvature, truth, answer)
         text = (
             f"{now.time_s:6.2f} s  {now.speed_kmh:5.1f} km/h  steer {steer:+.3f}  "
             f"d {offset:+.3f} m  angle {now.angle:+.4f} rad  lap {now.lap}"

@@ -173,14 +173,14 @@ def note_noise(measured: Vector, memory: Any) -> None:
 
 
 @lru_cache(maxsize=8)
-def transitions(dt: float, model: LateralModel = CAR) -> Vector:
+def transitions(dt: float) -> Vector:
     """Exact transitions (speeds, 5, 6) from state and wheel angle (rad) over `dt` s, by speed."""
     speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
-    return np.array([_transition(float(speed), dt, model) for speed in speeds])
+    return np.array([_transition(float(speed), dt) for speed in speeds])
 
 
-def _transition(speed: float, dt: float, model: LateralModel) -> Vector:
-    lateral, wheel, turn = model.matrices(speed)
+def _transition(speed: float, dt: float) -> Vector:
+    lateral, wheel, turn = CAR.matrices(speed)
     block = np.zeros((STATES + 1, STATES + 1))
     block[E, THETA], block[E, V] = speed, 1.0
     block[THETA, R], block[THETA, KAPPA] = 1.0, -speed

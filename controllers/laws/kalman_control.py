@@ -28,14 +28,14 @@ from controllers.interface import (
     VX,
     VY,
     YAW_RATE,
+    BatchController,
     LoopConfig,
-    Observation,
     Observations,
 )
 from controllers.laws.kalman import CAR, KAPPA, THETA, E, R, StateEstimate, V
 from controllers.laws.lateral_model import Matrix
 from controllers.laws.lqr import limited
-from controllers.laws.lqr_gains import SLOWEST_M_S, LqrWeights, SpeedTable, row_at
+from controllers.laws.lqr_gains import SLOWEST_M_S, LqrWeights, row_at, speed_table
 from controllers.laws.mpc import Mpc, MpcWeights
 from controllers.laws.steering import STEERING_LOCK, steer_for
 from runtime.jit import compiled_for_threads
@@ -63,7 +63,7 @@ def make_mpc_kalman(loop: LoopConfig, **weights: float) -> "MpcKalman":
     return MpcKalman(loop.dt, replace(MPC_WEIGHTS, **weights), loop.delay_s)
 
 
-class LqrKalman:
+class LqrKalman(BatchController):
     """Linear quadratic regulator on the estimated state at a control step of `dt` s.
 
     `delay_s`: the delay of the perception, if it is known; otherwise it is estimated.
@@ -79,14 +79,11 @@ class LqrKalman:
         self.estimate = StateEstimate(dt, delay_s)
         self.wheel_angles: Matrix = np.zeros(0)
         """rad of the front wheels of each car since the last control step."""
-        self._gains = SpeedTable(lambda speed: smooth_gain(weights, wheel_rate, speed, dt))
-        self._cautious = SpeedTable(
+        self._gains = speed_table(lambda speed: smooth_gain(weights, wheel_rate, speed, dt))
+        self._cautious = speed_table(
             lambda speed: smooth_gain(WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY, speed, dt)
         )
-        self._steady_bends = SpeedTable(CAR.cornering)
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
+        self._steady_bends = speed_table(CAR.cornering)
 
     def update_batch(self, observations: Observations) -> Matrix:
         if len(self.wheel_angles) != len(observations):
@@ -94,11 +91,11 @@ class LqrKalman:
         states = self.estimate.update(observations, self.wheel_angles)
         return regulate_smoothly(
             *(self.estimate.speeds, states, self.estimate.delays, self.wheel_angles),
-            *(self._gains.rows, self._cautious.rows, self._steady_bends.rows),
+            *(self._gains, self._cautious, self._steady_bends),
         )
 
 
-class MpcKalman:
+class MpcKalman(BatchController):
     """Model predictive control on the estimated state at a control step of `dt` s.
 
     `delay_s`: the delay of the perception, if it is known; otherwise it is estimated.
@@ -113,9 +110,6 @@ class MpcKalman:
         self.estimate = StateEstimate(dt, delay_s)
         self._mpc = Mpc(dt, weights, preview=True)
         self._steers: Matrix = np.zeros(0)
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
 
     def update_batch(self, observations: Observations) -> Matrix:
         if len(self._steers) != len(observations):

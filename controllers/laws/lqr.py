@@ -40,18 +40,18 @@ from controllers.interface import (
     VX,
     VY,
     YAW_RATE,
+    BatchController,
     LoopConfig,
-    Observation,
     Observations,
 )
 from controllers.laws.lateral_model import LateralModel, Matrix
 from controllers.laws.lqr_gains import (
     SLOWEST_M_S,
     LqrWeights,
-    SpeedTable,
     continuous_gains,
     discrete_gains,
     row_at,
+    speed_table,
 )
 from controllers.laws.steering import steer_for
 from controllers.perception.curvature import next_curvature
@@ -104,99 +104,79 @@ def approach_limit(loop: LoopConfig) -> float:
     return APPROACH_RAD if loop.noisy else UNLIMITED_RAD
 
 
-class Lqr:
+class Lqr(BatchController):
     """The paper's regulator at a control step of `dt` s; all gains are computed at the start."""
 
     def __init__(
         self,
         dt: float = 0.05,
         weights: LqrWeights = WEIGHTS_EXACT,
-        model: LateralModel | None = None,
         *,
         rate_filter_s: float = 0.0,
         approach_rad: float = UNLIMITED_RAD,
     ) -> None:
-        self.dt, self.weights, self.model = dt, weights, model or LateralModel()
-        self._gains = discrete_gains(self.model, weights, dt)
+        self.dt = dt
+        self._gains = discrete_gains(weights, dt)
         self._blend = blend_for(dt, rate_filter_s)
         self._approach_rad = approach_rad
         self._rates = np.zeros((0, RATE))
-
-    def gain(self, speed: float) -> Matrix:
-        """K (4,) at `speed` m/s."""
-        return self._gains(speed)
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
 
     def update_batch(self, observations: Observations) -> Matrix:
         if len(self._rates) != len(observations):
             self._rates = np.zeros((len(observations), RATE))
         return regulate(
-            *(observations.rows, self._gains.rows, self._rates),
+            *(observations.rows, self._gains, self._rates),
             *(self.dt, self._blend, self._approach_rad),
         )
 
 
-class LqrPreview:
+class LqrPreview(BatchController):
     """The regulator with feed-forward of the curvature, at a control step of `dt` s."""
 
     def __init__(
         self,
         dt: float = 0.05,
         weights: LqrWeights = WEIGHTS_PAPER,
-        model: LateralModel | None = None,
         *,
         curvature_filter_s: float = 0.4,
         approach_rad: float = UNLIMITED_RAD,
     ) -> None:
-        self.dt, self.weights, self.model = dt, weights, model or LateralModel()
-        self._gains = discrete_gains(self.model, weights, dt)
-        self._steady_bends = SpeedTable(self.model.cornering)
+        self.dt = dt
+        self._gains = discrete_gains(weights, dt)
+        self._steady_bends = speed_table(LateralModel().cornering)
         self._filter_s = curvature_filter_s
         self._approach_rad = approach_rad
         self._curvatures = np.zeros(0)
-
-    def gain(self, speed: float) -> Matrix:
-        """K (4,) at `speed` m/s."""
-        return self._gains(speed)
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
 
     def update_batch(self, observations: Observations) -> Matrix:
         if len(self._curvatures) != len(observations):
             self._curvatures = np.zeros(len(observations))
         return regulate_with_preview(
-            *(observations.rows, self._gains.rows, self._steady_bends.rows, self._curvatures),
+            *(observations.rows, self._gains, self._steady_bends, self._curvatures),
             *(self.dt, self._filter_s, self._approach_rad),
         )
 
 
-class LqrPaper:
+class LqrPaper(BatchController):
     """The regulator as the paper's released code runs it."""
 
     def __init__(
         self,
         dt: float = 0.05,
         weights: LqrWeights = WEIGHTS_PAPER,
-        model: LateralModel | None = None,
     ) -> None:
-        self.dt, self.weights, self.model = dt, weights, model or LateralModel()
-        self._gains = continuous_gains(self.model, weights)
+        self.dt = dt
+        self._gains = continuous_gains(weights)
         self._rates = np.zeros((0, 2, RATE))
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
 
     def update_batch(self, observations: Observations) -> Matrix:
         if len(self._rates) != len(observations):
             self._rates = np.zeros((len(observations), 2, RATE))
-        return regulate_as_released(observations.rows, self._gains.rows, self._rates, self.dt)
+        return regulate_as_released(observations.rows, self._gains, self._rates, self.dt)
 
 
 # The compiled laws: `seen` are the rows of `Observations` (N, OBSERVED), `gains` those of a
-# `SpeedTable`. They return the steering actions (N,).
+# `speed_table`. They return the steering actions (N,).
 
 
 @compiled_for_threads

@@ -54,28 +54,16 @@ def discrete_gain(model: LateralModel, weights: LqrWeights, speed: float, dt: fl
     return gain
 
 
-def continuous_gain(model: LateralModel, weights: LqrWeights, speed: float) -> Matrix:
-    """K (4,) of the continuous regulator at one speed (m/s)."""
-    A, B, _ = model.matrices(speed)
-    gain: Matrix = clqr(A, B, weights.Q, weights.R)[0]
-    return gain
-
-
-class SpeedTable:
-    """Rows computed at a grid of speeds, interpolated linearly, constant outside the grid."""
-
-    def __init__(self, compute: Callable[[float], Matrix | tuple[float, ...]]) -> None:
-        speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
-        self.rows: Matrix = np.array([compute(float(speed)) for speed in speeds])
-
-    def __call__(self, speed: float) -> Matrix:
-        """The row (n,) at `speed` m/s."""
-        return row_at(self.rows, speed)
+def speed_table(compute: Callable[[float], Matrix | tuple[float, ...]]) -> Matrix:
+    """Rows (speeds, n) computed at a grid of speeds, for `row_at`."""
+    speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
+    return np.array([compute(float(speed)) for speed in speeds])
 
 
 @compiled
 def row_at(rows: Matrix, speed: float) -> Matrix:
-    """The row (n,) at `speed` m/s of the `rows` (speeds, n) of a `SpeedTable`."""
+    """The row (n,) at `speed` m/s of the `rows` (speeds, n) of a `speed_table`: interpolated
+    linearly, constant outside the grid."""
     place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
     low = min(int(place), len(rows) - 2)
     share = place - low
@@ -84,12 +72,19 @@ def row_at(rows: Matrix, speed: float) -> Matrix:
 
 
 @lru_cache(maxsize=64)
-def discrete_gains(model: LateralModel, weights: LqrWeights, dt: float) -> SpeedTable:
-    """`discrete_gain` by speed. Cached, because a command may make many equal controllers."""
-    return SpeedTable(lambda speed: discrete_gain(model, weights, speed, dt))
+def discrete_gains(weights: LqrWeights, dt: float) -> Matrix:
+    """The `speed_table` of `discrete_gain` for the paper's car. Cached, because a command may make
+    many equal controllers."""
+    return speed_table(lambda speed: discrete_gain(LateralModel(), weights, speed, dt))
 
 
 @lru_cache(maxsize=64)
-def continuous_gains(model: LateralModel, weights: LqrWeights) -> SpeedTable:
-    """`continuous_gain` by speed."""
-    return SpeedTable(lambda speed: continuous_gain(model, weights, speed))
+def continuous_gains(weights: LqrWeights) -> Matrix:
+    """The `speed_table` of the continuous regulator's gain K (4,) for the paper's car."""
+
+    def gain(speed: float) -> Matrix:
+        A, B, _ = LateralModel().matrices(speed)
+        found: Matrix = clqr(A, B, weights.Q, weights.R)[0]
+        return found
+
+    return speed_table(gain)

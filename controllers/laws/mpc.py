@@ -35,8 +35,8 @@ from controllers.interface import (
     TO_LANE_CENTRE,
     VX,
     YAW_RATE,
+    BatchController,
     LoopConfig,
-    Observation,
     Observations,
 )
 from controllers.laws.steering import STEERING_LOCK, steer_for
@@ -85,7 +85,7 @@ def _weights(loop: LoopConfig) -> MpcWeights:
     return WEIGHTS_PERCEIVED if loop.noisy else WEIGHTS_EXACT
 
 
-class Mpc:
+class Mpc(BatchController):
     """Model predictive control at a control step of `dt` s; it keeps the last solution."""
 
     def __init__(
@@ -102,9 +102,6 @@ class Mpc:
         self._cost = np.array([weights.offset, weights.heading, weights.wheel])
         self._curvatures = np.zeros(0)
         self.update_batch(Observations(np.zeros((0, OBSERVED))))  # compiles
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
 
     def update_batch(self, observations: Observations) -> Vector:
         if len(self.plans) != len(observations):

@@ -46,14 +46,13 @@ class SpeedHold:
         dt: float,
         allowed: AllowedSpeed,
         slope: Callable[[CarState], float],
-        car: CarParameters | None = None,
     ) -> None:
         if not SLOWEST <= speed <= FASTEST:
             raise UserError(
                 f"a speed of {speed:g} m/s is out of range; give {SLOWEST:g} to {FASTEST:g}"
             )
         self._speed, self._dt, self._allowed, self._slope = speed, dt, allowed, slope
-        self._target = TargetSpeed(car or CarParameters(), dt)
+        self._target = TargetSpeed(CarParameters(), dt)
         self._settled_in_s = SETTLED_S + speed / GAINING
         self._errors: list[float] = []
 

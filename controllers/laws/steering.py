@@ -8,6 +8,6 @@ STEERING_LOCK = CarParameters.steering_lock
 
 
 @callable_from_compiled
-def steer_for(wheel_angle: float, lock: float = STEERING_LOCK) -> float:
+def steer_for(wheel_angle: float) -> float:
     """The steering action in [-1, 1] for a front wheel angle (rad)."""
-    return max(-1.0, min(1.0, wheel_angle / lock))
+    return max(-1.0, min(1.0, wheel_angle / STEERING_LOCK))

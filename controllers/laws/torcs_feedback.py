@@ -7,7 +7,6 @@ simulator must drive the same laps as TORCS.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,13 +16,16 @@ from controllers.interface import (
     VX,
     VY,
     YAW_RATE,
+    BatchController,
     LoopConfig,
-    Observation,
     Observations,
 )
 from controllers.laws.lateral_model import Matrix
 from controllers.laws.steering import steer_for
 from runtime.jit import compiled_for_threads
+
+OFFSET, OFFSET_RATE, HEADING_ERROR, TURN = 1.0, 0.1, 2.0, 0.1
+"""Gains in rad of the front wheels per m, m/s, rad and rad/s."""
 
 
 def make_torcs(loop: LoopConfig) -> "StateFeedback":
@@ -31,37 +33,26 @@ def make_torcs(loop: LoopConfig) -> "StateFeedback":
     return StateFeedback()
 
 
-@dataclass(frozen=True)
-class StateFeedback:
-    """Gains in rad of the front wheels per m, m/s, rad and rad/s."""
-
-    offset: float = 1.0
-    offset_rate: float = 0.1
-    heading: float = 2.0
-    yaw_rate: float = 0.1
-
-    def update(self, observation: Observation) -> float:
-        return float(self.update_batch(Observations.of(observation))[0])
+class StateFeedback(BatchController):
+    """The law, with the gains of the module's formula."""
 
     def update_batch(self, observations: Observations) -> Matrix:
-        gains = (self.offset, self.offset_rate, self.heading, self.yaw_rate)
-        return feed_back(observations.rows, gains)
+        return feed_back(observations.rows)
 
 
 @compiled_for_threads
-def feed_back(seen: Matrix, gains: tuple[float, float, float, float]) -> Matrix:
+def feed_back(seen: Matrix) -> Matrix:
     """The steering actions (N,) for the rows of `Observations` (N, OBSERVED)."""
     steers = np.empty(len(seen))
-    offset, offset_rate, heading, yaw_rate = gains
     for k in range(len(seen)):
         theta = -seen[k, ANGLE]
         rate = seen[k, VY] + seen[k, VX] * math.sin(theta)
         steers[k] = steer_for(
             -(
-                offset * seen[k, TO_LANE_CENTRE]
-                + offset_rate * rate
-                + heading * theta
-                + yaw_rate * seen[k, YAW_RATE]
+                OFFSET * seen[k, TO_LANE_CENTRE]
+                + OFFSET_RATE * rate
+                + HEADING_ERROR * theta
+                + TURN * seen[k, YAW_RATE]
             )
         )
     return steers

@@ -49,19 +49,15 @@ class AnswerSource(Protocol[Request, Answer]):
 
     def ask(self, frame: Request) -> Answer:
         """Return the answer to `frame`; waits for it."""
-        ...
 
     def put(self, frame: Request, step: int) -> None:
         """Request the answer to the frame of a control step, without waiting."""
-        ...
 
     def take(self) -> list[TimedAnswer[Answer]]:
         """The answers received since the last call, oldest first."""
-        ...
 
     def close(self) -> None:
         """Release what the source holds open."""
-        ...
 
 
 class ImmediateAnswers(Generic[Answer]):

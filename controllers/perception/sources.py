@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from controllers.perception.perceived import Perceive, Perceived
+from datagen.recording.images import encode
 from trackfeatures import RoadClass, UserError
 from trackfeatures.camera import CameraParameters
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from simulator.world.world import World
 
 Image = NDArray[np.uint8]
-JPEG_QUALITY = 95  # as in the recorded training images
 LOOK_AHEAD_S = 0.1
 """The ground truth has the curvature this far ahead: about the delay of steering and tyres."""
 
@@ -33,11 +33,9 @@ class FeatureModel(Protocol):
 
     def predict(self, image: Image) -> dict[str, Any]:
         """The prediction for an image (H, W, 3) RGB, in the format of the service's answers."""
-        ...
 
     def close(self) -> None:
         """Release what the model holds open."""
-        ...
 
 
 def truth(lane_centre: float) -> Perceive:
@@ -92,12 +90,7 @@ class ServiceModel:
         self.model_hash = str(card.get("model_hash"))
 
     def predict(self, image: Image) -> dict[str, Any]:
-        import simplejpeg
-
-        body = simplejpeg.encode_jpeg(
-            np.ascontiguousarray(image), quality=JPEG_QUALITY, colorsubsampling="420"
-        )
-        return self._client.features(body)
+        return self._client.features(encode(image, "jpeg"))  # as the recorded training images
 
     def close(self) -> None:
         self._client.close()

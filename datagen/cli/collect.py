@@ -5,16 +5,16 @@ datagen collect --rounds 60 --out datasets/default
 
 import sys
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from datagen.planning.config import DATASET_FOLDER, UNSEEN_FOLDER, CollectConfig, all_lights
 from datagen.recording.names import UNSEEN
 from runtime import cli as command
-from runtime.cli import AsJson, counted, options, print_result
+from runtime.cli import AsJson, counted, print_result
+from runtime.options import options_of
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
@@ -69,9 +69,9 @@ ExecutorName = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; record nothing.")]
 
 
-@options(CollectConfig)
+@options_of(CollectConfig, make=dict)
 def collect(
-    make_config: partial[CollectConfig],
+    values: dict[str, Any],
     out: Out = None,
     workers: Workers = 0,
     tracks: Tracks = "",
@@ -93,9 +93,9 @@ def collect(
     from runtime.camera_file import read_camera
     from trackfeatures.camera import CameraParameters
 
-    unseen = make_config.keywords["split"] == UNSEEN
-    config = make_config(
-        tracks=choose_tracks(names(tracks), tracks_dir, unseen),
+    config = CollectConfig(
+        **values,
+        tracks=choose_tracks(names(tracks), tracks_dir, unseen=values["split"] == UNSEEN),
         lanes=numbers(lanes),
         lights=names(lights) or all_lights(),
         camera=CameraParameters() if camera is None else read_camera(camera, CameraParameters()),

@@ -3,7 +3,6 @@
 datagen protocol --out datasets/protocol
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,16 +10,17 @@ import typer
 
 from datagen.cli.collect import TracksDir, Workers, print_recorded, record_plan
 from datagen.planning.config import ProtocolConfig, TrackChoice
-from runtime.cli import AsJson, options
+from runtime.cli import AsJson
+from runtime.options import options_of
 
 FOLDER = Path("datasets/protocol")
 
 Out = Annotated[Path, typer.Option(help="Dataset folder; an unfinished one is continued.")]
 
 
-@options(ProtocolConfig)
+@options_of(ProtocolConfig)
 def protocol(
-    make_config: partial[ProtocolConfig],
+    config: ProtocolConfig,
     out: Out = FOLDER,
     workers: Workers = 0,
     tracks_dir: TracksDir = None,
@@ -36,7 +36,7 @@ def protocol(
     from datagen.planning.protocol import protocol_plan
     from datagen.planning.summary import expected_classes
 
-    plan = protocol_plan(make_config(), tracks_dir)
+    plan = protocol_plan(config, tracks_dir)
     choices = {entry.track: TrackChoice(entry.track, entry.track_hash) for entry in plan.rounds}
     classes = expected_classes(plan, TrackForecast.of(tuple(choices.values()), tracks_dir))
     print_recorded(record_plan(plan, classes, out, workers, tracks_dir, "local", None), as_json)

@@ -31,24 +31,14 @@ class SteeringLaw(Protocol):
 
     def road_curvature(self, state: CarState) -> float:
         """Curvature (1/m) of the car's path along the road just ahead."""
-        ...
 
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
         """The steering action in [-1, 1] towards a path, as `LateralLaw.steer`."""
-        ...
 
     def restart(self) -> None:
         """Forget the past: the car was put back onto the road."""
-        ...
-
-
-class _ScriptedLaw(LateralLaw):
-    """The default law. It has no state, so a restart changes nothing."""
-
-    def restart(self) -> None:
-        """Do nothing."""
 
 
 class ScriptedDriver:
@@ -60,17 +50,16 @@ class ScriptedDriver:
         course: Course,
         speed: float,
         frequency_hz: int = 20,
-        car: CarParameters | None = None,
         *,
         law: SteeringLaw | None = None,
     ) -> None:
         """`speed` in m/s, where road and traffic allow it. `law` replaces the default law."""
-        car = car or CarParameters()
+        car = CarParameters()
         self._road = road
         self._course = course
         self._dt = 1.0 / frequency_hz
         self._max_offset = max_offset(road)
-        self._law = law or _ScriptedLaw(
+        self._law = law or LateralLaw(
             car, road, natural_frequency=NATURAL_FREQUENCY, damping=DAMPING
         )
         self._profile = speed_profile(road.track, speed, self._max_offset)
@@ -93,11 +82,6 @@ class ScriptedDriver:
     def speed_at(self, s: float) -> float:
         """Target speed (m/s) at `s` (m)."""
         return self._profile.at(s)
-
-    @property
-    def target_offset(self) -> float:
-        """Target offset (m) of the last command."""
-        return self._steered_for or 0.0
 
     def command(self, state: CarState, traffic: Traffic, driven_m: float) -> Command:
         """The command for one control step; `driven_m` counts from the start of the round and

@@ -20,6 +20,7 @@ from datagen.export.split_sides import Progress, Side
 from datagen.recording.errors import DatasetError
 from datagen.recording.round_metadata import RoundInfo
 from datagen.view.steps import Step, Steps
+from runtime.files import write_json
 from trackfeatures.camera import CameraParameters
 
 VERSION = "v3.0"
@@ -42,8 +43,8 @@ def write(folder: Path, parts: list[Side], camera: CameraParameters, progress: P
     _write_tasks(folder / "meta/tasks.parquet", tasks)
     (folder / EPISODES_FILE).parent.mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(writer.rows), folder / EPISODES_FILE)
-    _write_json(folder / "meta/stats.json", writer.stats())
-    _write_json(folder / "meta/info.json", _info(writer, parts, tasks, camera))
+    write_json(folder / "meta/stats.json", writer.stats())
+    write_json(folder / "meta/info.json", _info(writer, parts, tasks, camera))
 
 
 def _task(info: RoundInfo) -> str:
@@ -198,7 +199,3 @@ def _info(
         "video_path": None,
         "features": features(camera),
     }
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1) + "\n")

@@ -1,14 +1,15 @@
 """Exports chosen rounds of a dataset in one format into a new folder."""
 
 from dataclasses import dataclass
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
 from datagen.export import webdataset
-from datagen.export.card import card
 from datagen.export.output_folder import new_folder, require_free
 from datagen.export.split_sides import Progress, Side, sides
 from datagen.recording.dataset import Dataset
+from runtime.cli import counted
 from runtime.files import utf8_path
 from trackfeatures.errors import UserError
 
@@ -60,16 +61,16 @@ def export(folder: Path, out: Path, config: ExportConfig, progress: Progress) ->
     parts = sides(dataset, config.split)
     with new_folder(out) as partial:
         _write(partial, dataset, parts, config, progress)
-        about = card(dataset, parts, config.format, config.shard_size)
+        about = _card(dataset, parts, config.format, config.shard_size)
         (partial / "README.md").write_text(about, encoding="utf-8")
-        files = [path for path in partial.rglob("*") if path.is_file()]
-        size = sum(path.stat().st_size for path in files)
+        written = [path for path in partial.rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in written)
     return ExportResult(
         format=config.format,
         out=str(out),
         rounds=sum(len(side.rounds) for side in parts),
         frames=sum(side.frames for side in parts),
-        files=len(files),
+        files=len(written),
         bytes=size,
         content_hash=dataset.content_hash,
     )
@@ -85,3 +86,20 @@ def _write(
 
     with utf8_path(partial / "data") as inside:  # pyarrow takes UTF-8 names only
         lerobot.write(inside.parent, parts, dataset.camera, progress)
+
+
+def _card(dataset: Dataset, parts: list[Side], kind: str, shard_size: int) -> str:
+    """The README.md of an export: markdown with the front matter for Hugging Face, from the
+    template `webdataset.md` or `lerobot.md`."""
+    counts = ", ".join(
+        f"{side.name} {counted(side.frames, 'frame')} of {counted(len(side.rounds), 'round')}"
+        for side in parts
+    )
+    template = files("datagen.export").joinpath(f"{kind}.md").read_text(encoding="utf-8")
+    return template.format(
+        name=dataset.path.resolve().name,
+        counts=counts[0].upper() + counts[1:],
+        hash=dataset.content_hash,
+        first=parts[0].name,
+        last=(parts[0].frames - 1) // shard_size,
+    )

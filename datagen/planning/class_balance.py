@@ -43,7 +43,6 @@ class Forecast(Protocol):
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
         """Shares (N, 3) of the classes left, straight, right from each of `starts` (N,)."""
-        ...
 
 
 @dataclass(frozen=True)

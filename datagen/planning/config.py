@@ -1,6 +1,6 @@
 """The options of a collection: name, help text and default of each.
 
-Annotated fields are options of the commands (`runtime.cli.options`).
+Annotated fields are options of the commands (`runtime.options.options_of`).
 """
 
 from dataclasses import asdict, dataclass, field

@@ -69,8 +69,7 @@ class TimedMotion:
 
 @dataclass(frozen=True)
 class Mount:
-    """Angles in rad and height in m with their standard deviations; number of pictures and motions
-    used."""
+    """Angles in rad and height in m with their standard deviations; number of pictures used."""
 
     pitch: float
     yaw: float
@@ -81,7 +80,6 @@ class Mount:
     roll_std: float
     height_std_m: float
     pictures: int
-    motions: int
 
 
 @dataclass(frozen=True)
@@ -261,7 +259,6 @@ def _combine(
         float(np.hypot(roll_std, 2 * FLOOR)),
         float(height * share),
         len(straight),
-        0 if travel is None else len(motions),
     )
 
 

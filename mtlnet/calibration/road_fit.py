@@ -60,12 +60,11 @@ class Lines:
 
 @dataclass(frozen=True)
 class RoadFit:
-    """Result for one picture; the standard deviations include the error of the fit only."""
+    """Result for one picture; the standard deviation includes the error of the fit only."""
 
     x0: float
     y0: float
     bend: float
-    x0_std: float
     y0_std: float
     slopes: tuple[float, ...]
     """Slopes of the markings, leftmost first."""
@@ -143,7 +142,7 @@ def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit |
     if not (x0_std < MAX_FIT_STD and y0_std < MAX_FIT_STD):
         return None
     x0, y0, bend = map(float, state[:3])
-    return RoadFit(x0, y0, bend, float(x0_std), float(y0_std), tuple(np.sort(state[3:]).tolist()))
+    return RoadFit(x0, y0, bend, float(y0_std), tuple(np.sort(state[3:]).tolist()))
 
 
 def _below(lines: Lines, y0: float) -> FloatArray:

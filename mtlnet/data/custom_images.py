@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
-from mtlnet.data.labels_file import COLUMNS as COLUMNS
-from mtlnet.data.labels_file import LABELS as LABELS
-from mtlnet.data.labels_file import MARKING_LIMITS_M as MARKING_LIMITS_M
-from mtlnet.data.labels_file import CustomLabels, LabelledPicture, read_labels
+from mtlnet.data.labels_file import LABELS, CustomLabels, LabelledPicture, read_labels
 from mtlnet.data.picture_copies import PLAIN, copied_camera, copied_label, copied_picture
 from mtlnet.inference.image_decoding.decode import crop_and_resize, read_whole_image
 from mtlnet.inference.image_decoding.errors import Fault, ImageError

@@ -9,7 +9,7 @@ not evaluated. Columns and cells of `OPTIONAL` may be missing.
 
 import csv
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path, PurePosixPath
@@ -279,6 +279,16 @@ def lane_cells(ml: float, mr: float) -> Cells:
     if -ml < mr:
         return {**cells, "l": UNKNOWN, "m": _metres(ml), "r": _metres(mr)}
     return {**cells, "l": _metres(ml), "m": _metres(mr), "r": UNKNOWN}
+
+
+def lane_sides(metres: Mapping[str, float | None]) -> tuple[float, float] | None:
+    """`ml` and `mr` of distances by marking; where the car is too near to a marking, that marking
+    and the next. None without a lane."""
+    for pair in (("ml", "mr"), ("m", "r"), ("l", "m")):
+        left, right = (metres[name] for name in pair)
+        if left is not None and right is not None:
+            return left, right
+    return None
 
 
 def _metres(value: float) -> str:

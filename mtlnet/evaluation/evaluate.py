@@ -69,12 +69,7 @@ def evaluate(
     dataset = Dataset.open(data)
     frames = dataset.select(split).every(every)
     require_fit(engine.card, frames, split)
-    try:
-        outputs = predict_frames(engines, frames, report)
-    except UndecodableImage:
-        require_decodable(frames, data)  # names and counts all of them
-        raise
-    outputs = car_outputs(outputs, frames)
+    outputs = predict_rounds(engines, frames, data, report)
     mean = engine.card.data["mean"]
     found = {
         **about(engine),
@@ -130,6 +125,18 @@ def about(engine: Engine) -> dict[str, Any]:
         "engine": engine.kind,
         "precision": engine.precision,
     }
+
+
+def predict_rounds(
+    engines: Sequence[Engine], frames: Frames, data: Path, report: Callable[[int, int], None]
+) -> NDArray[np.float32]:
+    """`predict_frames` for recorded rounds, in metres at the car. Raises DatasetError with the
+    names of all undecodable images."""
+    try:
+        return car_outputs(predict_frames(engines, frames, report), frames)
+    except UndecodableImage:
+        require_decodable(frames, data)
+        raise
 
 
 def predict_frames(

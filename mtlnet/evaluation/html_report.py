@@ -20,7 +20,7 @@ from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import FEATURES, Prediction, decode_outputs, split_outputs
 from runtime.files import atomic_write
 from runtime.html import embed_jpeg, format_percent, render
-from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_diagram
+from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_diagram, runs
 
 FILE_NAME = "report.html"
 MAX_ROUNDS = 8
@@ -137,7 +137,11 @@ def _drive_charts(
     offset = tf.localise(tf.decode(outputs[:, :6])[0])
     angle, std = tf.decode_values(outputs[:, :6])[:, 5], split_outputs(outputs).std
     thinned = slice(None, None, -(-len(rows) // MAX_POINTS))
-    shaded = _intervals(metres, labels.shadow_fraction >= HEAVY_SHADOW)
+    last = len(rows) - 1
+    shaded = [
+        (float(metres[run.start]), float(metres[min(run.stop, last)]))
+        for run in runs(labels.shadow_fraction >= HEAVY_SHADOW)
+    ]
     for title, unit, true, predicted, column in (
         ("offset from the lane centre", "m", tf.localise(labels.distances), offset, -2),
         ("angle", "rad", labels.angle.astype(np.float64), angle, -1),
@@ -160,15 +164,6 @@ def _distance_driven(s: NDArray[np.float64]) -> NDArray[np.float64]:
     steps = np.diff(s)
     steps[steps < 0] = 0.0
     return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _intervals(x: NDArray[np.float64], chosen: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """x of the begin and end of each interval in which `chosen` (N,) is true without a gap."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
-    last = len(x) - 1
-    return [
-        (float(x[a]), float(x[min(b, last)])) for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
 
 
 # The frames with the largest errors, with true and predicted markings drawn on them.
@@ -224,7 +219,6 @@ def worst_figures(
         image = draw_overlay(
             frames.image(row),
             view,
-            view.height_above_road_m,
             float(labels.curvature[row]),
             (dict(zip(tf.MARKINGS, truth, strict=True)), float(labels.angle[row])),
             (prediction.distances_m, prediction.angle_rad),

@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.recording import Dataset, Frames, Labels, UndecodableImage
+from datagen.recording import Dataset, Frames, Labels
 from datagen.recording.names import MIDDLE, UNSEEN
-from mtlnet.data.model_labels import car_outputs
-from mtlnet.data.rounds import require_decodable
-from mtlnet.evaluation.evaluate import about, predict_frames, require_fit
+from mtlnet.evaluation.evaluate import about, predict_rounds, require_fit
 from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import FEATURES, OUTPUTS
@@ -71,11 +69,7 @@ def evaluate_protocol(
     card = engines[0].card
     for side in ("test", UNSEEN):
         require_fit(card, dataset.select(side), side)
-    try:
-        outputs = car_outputs(predict_frames(engines, frames, report), frames)
-    except UndecodableImage:
-        require_decodable(frames, data)  # names and counts all of them
-        raise
+    outputs = predict_rounds(engines, frames, data, report)
     driven = np.concatenate([*rows.values()])
     found = evaluate_by_groups(
         np.delete(outputs, driven, axis=0), frames.without(driven), card.data["mean"]

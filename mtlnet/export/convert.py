@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from datagen.recording import Dataset
 from mtlnet.architecture import HEIGHT, WIDTH
-from mtlnet.data.custom_images import LABELS, has_labels_file
+from mtlnet.data.custom_images import has_labels_file
+from mtlnet.data.labels_file import LABELS
 from mtlnet.data.rounds import hold_out_rounds
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (
@@ -48,6 +49,7 @@ from mtlnet.model.openvino_graph import (
     build_graph,
     narrow_constants,
 )
+from mtlnet.model.served import ServedNetwork
 from runtime.files import atomic_move, file_hash, replaced_files, utf8_path, write_json
 from trackfeatures.errors import UserError
 
@@ -158,24 +160,17 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
     write_json(folder / EXPORT_FILE, content)
 
 
-class WithProbabilities(torch.nn.Module):
-    """A network with a softmax on its class scores: images uint8 (B, H, W, 3) -> (B, 9).
+class OnnxNetwork(ServedNetwork):
+    """A network without uncertainty head: images uint8 (B, H, W, 3) -> (B, 9).
 
     With heads over bins there is a second result (B, 5): probabilities that each marking is absent.
     """
 
-    def __init__(self, network: Network) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The nine outputs, and the probabilities of absence if the heads give them."""
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:  # type: ignore[override]
         x = self.network.forward_features(images)
-        outputs = self.network.forward_heads(x)
-        outputs = torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
         if not self.network.architecture.bins:
-            return (outputs,)
-        return outputs, self.network.absent_probabilities(x)
+            return (self.network.nine_outputs(x),)
+        return self.network.nine_outputs(x), self.network.absent_probabilities(x)
 
 
 def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]:
@@ -186,7 +181,7 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
     path = folder / ONNX_FILE
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     program = torch.onnx.export(
-        WithProbabilities(network).eval(),
+        OnnxNetwork(network).eval(),
         (images,),
         dynamo=True,
         opset_version=OPSET,

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import save
+from torch import Tensor
 
 import trackfeatures as tf
 from mtlnet.architecture import HEIGHT, WIDTH
@@ -32,7 +33,7 @@ from mtlnet.inference.model_card import (
     ModelError,
 )
 from mtlnet.inference.prediction import COLUMNS, OUTPUTS
-from mtlnet.model.network import Network, fold, predict_images
+from mtlnet.model.network import Network, fold, load_network, predict_images
 from mtlnet.model.openvino_graph import TOLERANCE, UNCERTAINTY_TOLERANCE, write_graph
 from mtlnet.model.served import ServedNetwork
 from mtlnet.model.uncertainty_head import FittedUncertainty, UncertaintyHead
@@ -76,18 +77,11 @@ def publish(
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
     head = None if uncertainty is None else uncertainty.head
-    golden = golden_image(WIDTH, HEIGHT)
-    names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
-    if head is not None:
-        names = (*names, UNCERTAINTY_WEIGHTS)
     origin = provenance or Provenance()
     with replaced_files(run, last=CARD) as staged:
-        atomic_write(staged / WEIGHTS, save(weights), fsync=True)
-        if head is not None:
-            atomic_write(staged / UNCERTAINTY_WEIGHTS, head.to_bytes(), fsync=True)
+        files = write_model(staged, folded.architecture.name, weights, head)
         check = {"frames": 0.0}
-        if GRAPH in names:
-            write_graph(folded, staged / GRAPH, staged / GRAPH_WEIGHTS, head)
+        if GRAPH in files:
             check = compare_graph(folded, staged, images, head)
             _require_equal(run, check)
         card = ModelCard(
@@ -97,13 +91,43 @@ def publish(
             program_version=package_versions()["driverview"],
             **{field.name: getattr(origin, field.name) for field in fields(origin)},
             versions=package_versions(),
-            files={name: file_hash(staged / name) for name in names},
+            files=files,
             export_check=check,
-            golden=tuple(float(v) for v in predict_images(folded, golden[None])[0]),
+            golden=golden_outputs(folded),
             uncertainty=None if uncertainty is None else uncertainty.about,
         )
         card.write(staged)
     return card
+
+
+def write_model(
+    folder: Path,
+    network: str,
+    weights: dict[str, Tensor],
+    head: UncertaintyHead | None,
+    *,
+    narrow: bool = False,
+) -> dict[str, str]:
+    """Write weights, graph and uncertainty head of a folded `network` to `folder`; returns the hash
+    of each file.
+
+    Without OpenVINO there is no graph. `narrow`: the graph stores float16 weights as such.
+    """
+    names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
+    atomic_write(folder / WEIGHTS, save(weights), fsync=True)
+    if head is not None:
+        names = (*names, UNCERTAINTY_WEIGHTS)
+        atomic_write(folder / UNCERTAINTY_WEIGHTS, head.to_bytes(), fsync=True)
+    if GRAPH in names:
+        read = load_network(folder / WEIGHTS, network)
+        write_graph(read, folder / GRAPH, folder / GRAPH_WEIGHTS, head, narrow=narrow)
+    return {name: file_hash(folder / name) for name in names}
+
+
+def golden_outputs(network: Network) -> tuple[float, ...]:
+    """The outputs (9,) of a folded network for the golden image."""
+    images = golden_image(WIDTH, HEIGHT)[None]
+    return tuple(map(float, predict_images(network, images)[0]))
 
 
 def _require_equal(run: Path, check: dict[str, float]) -> None:

@@ -15,18 +15,15 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
-from safetensors.numpy import save
+from torch import Tensor
 
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.evaluation.metrics import GROUPS
+from mtlnet.export.publish import golden_outputs, write_model
 from mtlnet.inference.engine import INT8, Engine, has_openvino, load_engine, read_export
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
-    GRAPH,
-    GRAPH_WEIGHTS,
-    MODEL_FILES,
-    UNCERTAINTY_WEIGHTS,
     WEIGHTS,
     ModelCard,
     ModelError,
@@ -35,10 +32,10 @@ from mtlnet.inference.model_card import (
 from mtlnet.inference.prediction import OUTPUTS
 from mtlnet.inference.torch_engine import load_served
 from mtlnet.inference.trained_rounds import Seeds
-from mtlnet.model.network import load_network, predict_images
-from mtlnet.model.openvino_graph import TOLERANCE, write_graph
+from mtlnet.model.network import load_network
+from mtlnet.model.openvino_graph import TOLERANCE
 from mtlnet.uncertainty_fit.head import refit_uncertainty_head
-from runtime.files import atomic_write, file_hash
+from runtime.files import atomic_write
 from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
 
@@ -61,49 +58,34 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
         seeds = Seeds.read(card.data["seeds"]) | Seeds.read(refitted.about["seeds"])
         seen = {**card.data, "seeds": seeds.entry()}
         card = replace(card, uncertainty=refitted.about, data=seen)
-    names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
-    if card.uncertainty is not None:
-        names = (*names, UNCERTAINTY_WEIGHTS)
     served = load_served(run, replace(card, uncertainty=None) if refitted is not None else card)
     head = served.head if refitted is None else refitted.head
-    halves = {name: half(name, t.numpy()) for name, t in served.network.state_dict().items()}
+    halves = {name: half(name, t) for name, t in served.network.state_dict().items()}
     out.mkdir(parents=True, exist_ok=True)
-    atomic_write(out / WEIGHTS, save(halves), fsync=True)
-    if head is not None:
-        atomic_write(out / UNCERTAINTY_WEIGHTS, head.to_bytes(), fsync=True)
-    if GRAPH in names:
-        network = load_network(out / WEIGHTS, card.network)
-        write_graph(network, out / GRAPH, out / GRAPH_WEIGHTS, head, narrow=True)
-    shipped = _card_of(out, card, names)
+    files = write_model(out, card.network, halves, head, narrow=True)
+    shipped = replace(
+        card,
+        name=out.resolve().name,
+        data=_without_folders(card.data),
+        files=files,
+        golden=golden_outputs(load_network(out / WEIGHTS, card.network)),
+    )
     shipped.write(out)
     try:
         check = _check(run, out)
     except ModelError:
         (out / CARD).unlink()
         raise
-    sizes = {name: (out / name).stat().st_size for name in (*names, CARD)}
+    sizes = {name: (out / name).stat().st_size for name in (*files, CARD)}
     return {"model": shipped.name, "out": str(out), "files": sizes, "check": check}
 
 
-def half(name: str, values: NDArray[np.float32]) -> NDArray[np.float16]:
+def half(name: str, values: Tensor) -> Tensor:
     """Weights in float16. Raises ModelError when one is outside its range."""
-    with np.errstate(over="ignore"):
-        rounded = values.astype(np.float16)
-    if not np.isfinite(rounded).all():
+    rounded = values.half()
+    if not rounded.isfinite().all():
         raise ModelError(f"{name} holds a weight beyond float16's range: train the model anew")
     return rounded
-
-
-def _card_of(out: Path, card: ModelCard, names: tuple[str, ...]) -> ModelCard:
-    network = load_network(out / WEIGHTS, card.network)
-    golden = predict_images(network, golden_image(WIDTH, HEIGHT)[None])[0]
-    return replace(
-        card,
-        name=out.resolve().name,
-        data=_without_folders(card.data),
-        files={name: file_hash(out / name) for name in names},
-        golden=tuple(float(value) for value in golden),
-    )
 
 
 def _without_folders(data: dict[str, Any]) -> dict[str, Any]:

@@ -43,12 +43,10 @@ def marking_line(
     return np.column_stack([along * cos - left * sin, along * sin + left * cos])
 
 
-def to_pixels(
-    points: NDArray[np.float64], camera: CameraParameters, height_m: float
-) -> NDArray[np.int32]:
+def to_pixels(points: NDArray[np.float64], camera: CameraParameters) -> NDArray[np.int32]:
     """Pixels (M, 2), enlarged by `SCALE`, of the road points (N, 2) in the car frame that the
-    camera sees. `height_m`: its height above the road."""
-    road = np.column_stack([points, np.full(len(points), camera.z - height_m)])
+    camera sees."""
+    road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     enlarged = (pixels + 0.5) * SCALE - 0.5  # about the corner of the picture, like cv2.resize
@@ -58,7 +56,6 @@ def to_pixels(
 def draw_overlay(
     frame: Image,
     camera: CameraParameters,
-    height_m: float,
     curvature: float,
     truth: tuple[Distances, float],
     prediction: tuple[Distances, float],
@@ -77,7 +74,7 @@ def draw_overlay(
             if distance is None:
                 continue
             line = marking_line(distance, angle, curvature)
-            pixels = to_pixels(line, camera, height_m)
+            pixels = to_pixels(line, camera)
             from_above = _top_view_pixels(line, top_view)
             cv2.polylines(canvas, [pixels], False, colour, thickness, cv2.LINE_AA)
             cv2.polylines(top_view, [from_above], False, colour, thickness, cv2.LINE_AA)

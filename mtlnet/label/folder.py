@@ -17,6 +17,7 @@ from mtlnet.data.labels_file import (
     Cells,
     check_cells,
     lane_cells,
+    lane_sides,
     read_cells,
     write_cells,
 )
@@ -128,9 +129,14 @@ class LabelFolder:
 
     def markings(self, number: int, camera: CameraParameters) -> Markings | None:
         """Label of a picture; None if it has none, or one without a lane."""
-        row = self.rows().get(self.files[number])
-        sides = None if row is None else _sides(row)
-        if row is None or sides is None:
+        row = self.rows().get(self.files[number], {})
+        texts = {name: row.get(name) for name in ("ml", "mr", "l", "m", "r")}
+        known = {
+            name: float(text) if text not in (None, "", UNKNOWN) else None
+            for name, text in texts.items()
+        }
+        sides = lane_sides(known)
+        if sides is None:
             return None
         curvature = float(row.get("curvature_1pm") or 0.0)
         return Markings(*sides, float(row["angle"]), curvature, camera.pitch_deg)
@@ -183,12 +189,3 @@ def _version(path: Path) -> tuple[object, ...]:
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     return path, found.st_ino, found.st_mtime_ns, found.st_size
-
-
-def _sides(row: Cells) -> tuple[float, float] | None:
-    """`ml` and `mr` of a row; where the car is too near to a marking, that marking and the next."""
-    for left, right in (("ml", "mr"), ("m", "r"), ("l", "m")):
-        cells = row[left], row[right]
-        if all(cell and cell != UNKNOWN for cell in cells):
-            return float(cells[0]), float(cells[1])
-    return None

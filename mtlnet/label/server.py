@@ -23,9 +23,10 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from mtlnet.data.labels_file import lane_sides
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.prediction import Prediction, decode_outputs
+from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
@@ -143,7 +144,7 @@ class Labeller:
             outputs = self._engine(seen)
         found = decode_outputs(lens.outputs(outputs[None])[0])
         note = "unlike the training images" if found.out_of_distribution else ""
-        sides = _lane(found)
+        sides = lane_sides(found.distances_m)
         if sides is None:
             return None, "the model sees no lane"
         return Markings(*sides, found.angle_rad, 0.0, camera.pitch_deg), note
@@ -163,16 +164,6 @@ class Labeller:
         camera = self.folder.camera(number, width, height)
         found = fit_markings(camera, drag.left, drag.right, drag.curvature, drag.pitch_deg)
         return shown(camera, found)
-
-
-def _lane(found: Prediction) -> tuple[float, float] | None:
-    """`ml` and `mr` of an answer; where the car is on a marking, that marking and the next."""
-    metres = found.distances_m
-    for left, right in (("ml", "mr"), ("m", "r"), ("l", "m")):
-        pair = metres[left], metres[right]
-        if pair[0] is not None and pair[1] is not None:
-            return pair[0], pair[1]
-    return None
 
 
 def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:

@@ -8,7 +8,6 @@ regression targets; `fold` converts it exactly to the paper's network.
 """
 
 import copy
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -44,7 +43,7 @@ from runtime.files import utf8_path
 NORM_EPS = 1e-5
 NORM_MOMENTUM = 0.1
 RUN_BATCH = 32
-"""Images per batch of `run_network`; the features of one image take some MB."""
+"""Images per batch of `predict_images`; the features of one image take some MB."""
 CODED_HEADS = (("distance", slice(0, 5)), ("angle", slice(5, 6)))
 """Heads of coded values and their columns in the outputs."""
 
@@ -107,6 +106,11 @@ class Network(nn.Module):
                 [coded * self.target_std + self.target_mean, self.heads["heading"](x)], 1
             )
 
+    def nine_outputs(self, x: Tensor) -> Tensor:
+        """Coded distances, coded angle and class probabilities (B, 9) for last shared features."""
+        outputs = self.forward_heads(x)
+        return torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
+
     def uncertainty_inputs(self, x: Tensor) -> Tensor:
         """Inputs of the uncertainty head (B, `architecture.uncertainty_inputs`).
 
@@ -118,12 +122,10 @@ class Network(nn.Module):
         return torch.cat([x.float(), log_spreads(scores.distance, scores.angle)], 1)
 
     def absent_probabilities(self, x: Tensor) -> Tensor:
-        """Probabilities (B, 5) that each marking is absent; (B, 0) for heads of coded values.
+        """Probabilities (B, 5) that each marking is absent, of heads over bins.
 
         `x` (B, 256): the last shared features.
         """
-        if not self.architecture.bins:
-            return x.new_empty(len(x), 0)
         return absent_probabilities(self.forward_scores(x).distance)
 
     def forward_scores(self, x: Tensor) -> Scores:
@@ -161,38 +163,16 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
     return network.eval()
 
 
-@dataclass(frozen=True)
-class NetworkOutputs:
-    """The results of a network for B images."""
-
-    uncertainty_inputs: NDArray[np.float32]
-    """Inputs of the uncertainty head (B, F)."""
-    outputs: NDArray[np.float32]
-    """Outputs (B, 9): coded distances, coded angle and class probabilities."""
-    absent: NDArray[np.float32]
-    """Probabilities (B, 5) that each marking is absent; (B, 0) for heads of coded values."""
-
-
-def run_network(network: Network, images: NDArray[np.uint8]) -> NetworkOutputs:
-    """Results for images (B, 210, 280, 3), computed in batches of `RUN_BATCH`."""
-    network.eval()
-    starts = range(0, max(len(images), 1), RUN_BATCH)
-    parts = [_run_batch(network, torch.from_numpy(images[i : i + RUN_BATCH])) for i in starts]
-    return NetworkOutputs(*(torch.cat(each).cpu().numpy() for each in zip(*parts, strict=True)))
-
-
-def _run_batch(network: Network, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The fields of `NetworkOutputs` for one batch."""
-    with torch.inference_mode():
-        x = network.forward_features(images.to(next(network.parameters()).device)).float()
-        outputs = network.forward_heads(x)
-        outputs[:, 6:] = torch.softmax(outputs[:, 6:], 1)
-        return network.uncertainty_inputs(x), outputs, network.absent_probabilities(x)
-
-
 def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The outputs (B, 9) of `run_network`."""
-    return run_network(network, images).outputs
+    """Outputs (B, 9) for images (B, 210, 280, 3), computed in batches of `RUN_BATCH`."""
+    network.eval()
+    device = next(network.parameters()).device
+    parts = []
+    with torch.inference_mode():
+        for first in range(0, max(len(images), 1), RUN_BATCH):
+            batch = torch.from_numpy(images[first : first + RUN_BATCH]).to(device)
+            parts.append(network.nine_outputs(network.forward_features(batch)))
+    return torch.cat(parts).cpu().numpy()
 
 
 # Layers.
@@ -203,8 +183,8 @@ class SamePad(nn.Module):
 
     def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
         super().__init__()
-        self.out_height, top, bottom = same_padding(height, layer.kernel, layer.stride)
-        self.out_width, left, right = same_padding(width, layer.kernel, layer.stride)
+        _, top, bottom = same_padding(height, layer.kernel, layer.stride)
+        _, left, right = same_padding(width, layer.kernel, layer.stride)
         self.pads = (left, right, top, bottom)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -25,17 +25,12 @@ class ServedNetwork(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         x = self.network.forward_features(images)
-        parts = [self.nine_outputs(x)]
+        parts = [self.network.nine_outputs(x)]
         if self.head is not None:
             parts.append(self.head(self.network.uncertainty_inputs(x), texture_features(images)))
         if self.network.architecture.bins:
             parts.append(self.network.absent_probabilities(x))
         return torch.cat(parts, 1)
-
-    def nine_outputs(self, x: Tensor) -> Tensor:
-        """Coded distances, coded angle and class probabilities (B, 9) for last shared features."""
-        outputs = self.network.forward_heads(x)
-        return torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
 
 
 class FitInputs(ServedNetwork):
@@ -44,4 +39,5 @@ class FitInputs(ServedNetwork):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
         x = self.network.forward_features(images)
-        return self.nine_outputs(x), self.network.uncertainty_inputs(x), texture_features(images)
+        outputs, inputs = self.network.nine_outputs(x), self.network.uncertainty_inputs(x)
+        return outputs, inputs, texture_features(images)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from datagen.recording.images import encode
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction
 from mtlnet.sources.read import SourceImage
@@ -150,11 +151,8 @@ class PictureWriter:
         stem = os.fsdecode(os.fsencode(Path(item.source).stem)[:MAX_STEM_BYTES])
         frame = [] if item.frame is None else [str(item.frame)]
         name = "-".join((f"{self._count:04d}", stem, *frame))
-        done, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-        if not done:
-            raise UserError(f"{name}.png: a picture of {picture.shape} cannot be written as PNG")
-        # Not with OpenCV, which needs UTF-8 names and does not report why it fails.
-        (self._folder / f"{name}.png").write_bytes(data.tobytes())
+        # Not written by OpenCV, which needs UTF-8 names and does not report why it fails.
+        (self._folder / f"{name}.png").write_bytes(encode(picture, "png"))
         self._count += 1
 
     def __enter__(self) -> Self:
@@ -183,7 +181,6 @@ def draw_prediction(
     picture = draw_overlay(
         item.image,
         camera,
-        camera.height_above_road_m,
         truth.curvature if truth else 0.0,
         (truth.distances_m, truth.angle_rad) if truth else ({}, 0.0),
         (prediction.distances_m, prediction.angle_rad),

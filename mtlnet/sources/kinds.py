@@ -53,7 +53,7 @@ FILM_STARTS = (
     b"\0\0\x01", bytes.fromhex("3026b2758e66cf11"),
 )  # fmt: skip
 MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide")
-TS_SYNC, TS_PACKETS = 0x47, ((0, 188), (4, 192))  # MPEG-TS, and with the times of Blu-ray
+TS_PACKETS = ((0, 188), (4, 192))  # MPEG-TS, and with the times of Blu-ray
 
 
 def kind_of(path: Path) -> SourceKind | None:

@@ -30,7 +30,6 @@ class Projector(Protocol):
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels and depth of world points."""
-        ...
 
 
 def marking_polylines(

@@ -63,6 +63,9 @@ class LateralLaw:
         )
         return min(max(wheel_angle / car.steering_lock, -1.0), 1.0)
 
+    def restart(self) -> None:
+        """Do nothing: the law has no state to forget."""
+
 
 def feedback_speed(state: CarState) -> float:
     """Speed (m/s) for which gains and preview are computed."""

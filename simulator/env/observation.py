@@ -104,7 +104,6 @@ class Renderer(Protocol):
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Copies of the views of the current state, in the order of `views`."""
-        ...
 
 
 class Observer:

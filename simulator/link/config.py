@@ -1,8 +1,11 @@
 """The options of one link server, with their defaults."""
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Annotated
 
+from typer import Option
+
+from simulator.track.cli import Lanes, LaneWidth, TracksDir, Traffic
 from trackfeatures import LANE_WIDTH_M
 
 DEFAULT_NAME = "/driverview"
@@ -13,18 +16,36 @@ DEFAULT_NAME = "/driverview"
 class LinkConfig:
     """The options of one link server."""
 
-    track: str = "circuit"
-    name: str = DEFAULT_NAME
-    lanes: int = 1
-    lane_width: float = LANE_WIDTH_M
-    traffic: int = 0
-    frequency_hz: int = 20
-    seed: int = 0
+    track: Annotated[str, Option(help="Name of a track, or a track file.")] = "circuit"
+    name: Annotated[str, Option(help="Name of the shared memory, such as /driverview.")] = (
+        DEFAULT_NAME
+    )
+    lanes: Lanes = 1
+    lane_width: LaneWidth = LANE_WIDTH_M
+    traffic: Traffic = 0
+    frequency_hz: Annotated[
+        int, Option("--frequency", help="Control steps per second; a divisor of 200.")
+    ] = 20
+    seed: Annotated[
+        int, Option(help="Seed of scenery and light, and of resets without a seed.", min=0)
+    ] = 0
     picture: tuple[int, int] = (0, 0)
     """Width and height of the camera images, (0, 0) for none."""
-    light: str = "clear"
-    tracks_dir: Path | None = None
-    realtime: bool = False
-    once: bool = False
-    patience_s: float = 600.0
-    """Longest wait for a command of a living client; 0: without limit."""
+    light: Annotated[str, Option(help="Light of the images, such as clear or rain.")] = "clear"
+    tracks_dir: TracksDir = None
+    realtime: Annotated[
+        bool,
+        Option(
+            "--realtime/--lock-step",
+            help="Step by the wall clock and hold the last command, or wait for a command before "
+            "each step.",
+        ),
+    ] = False
+    once: Annotated[bool, Option("--once", help="End when the first client disconnects.")] = False
+    patience_s: Annotated[
+        float,
+        Option(
+            "--patience",
+            help="Longest wait for a client's command, s; then the server ends. 0: no limit.",
+        ),
+    ] = 600.0

@@ -77,8 +77,7 @@ def export(
     ] = None,
 ) -> None:
     """Write a random road as a TOML file; commands accept the file's path as a track."""
-    from simulator.track.random_roads.export import write_road
-    from simulator.track.random_roads.road import seed_of
+    from simulator.track.random_roads.road import seed_of, write_road
 
     seed = seed_of(road)
     out = out or Path(f"random-{seed}.toml")

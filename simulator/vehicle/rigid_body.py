@@ -7,10 +7,9 @@ same whether PyBullet or this code moves the body. World frame, SI units.
 import math
 from typing import Any
 
-from runtime.jit import compiled, inlined
+from runtime.jit import inlined
 from simulator.arrays import FloatArray
 from simulator.vehicle.dynamics import DT, accelerate
-from simulator.vehicle.orientation import rotation
 
 
 @inlined
@@ -53,15 +52,10 @@ def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -
         quaternion[i] /= length
 
 
-@compiled
-def integrate(p: Any, motion: FloatArray, wrench: FloatArray) -> None:
-    """Move a free body by one physics step under `wrench` (6,), (force, torque)."""
-    integrate_with(p, rotation(motion[3:7]), motion, wrench)
-
-
 @inlined
-def integrate_with(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
-    """`integrate` of a body whose `axes` (3, 3) are already computed."""
+def integrate(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
+    """Move a free body with the `axes` (3, 3) by one physics step under `wrench` (6,), (force,
+    torque)."""
     tx, ty, tz = gyroscopic_change(p, axes, motion)
     accelerate(p, axes, wrench, DT, motion[7:13])
     for i in range(3):

@@ -1,58 +1,86 @@
-"""The options of `simulator watch`.
+"""The command `simulator watch`: drives and serves until Ctrl-C.
 
 simulator watch --track coast --lanes 2 --traffic 6 --light overcast --port 8765
 """
 
+import signal
+import socket
+import sys
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
-import typer
+from typer import Option
 
+from runtime.options import options_of
 from simulator.track.cli import Lanes, TracksDir, Traffic
+
+if TYPE_CHECKING:
+    from simulator.track.road import Road
+
+FREQUENCY_HZ: Final = 20
 
 
 @dataclass(frozen=True)
 class WatchConfig:
     """The options of `simulator watch`."""
 
-    track: str = "circuit"
-    lanes: int = 1
-    traffic: int = 0
-    light: str = "clear"
-    host: str = "127.0.0.1"
-    port: int = 8765
-    """0: any free port, which the first line names."""
-    speed: float = 1.0
-    """Simulated seconds per second of wall-clock time."""
-    seed: int = 0
-    tracks_dir: Path | None = None
+    track: Annotated[str, Option(help="Name of a track, or its file.")] = "circuit"
+    lanes: Lanes = 1
+    traffic: Traffic = 0
+    light: Annotated[str, Option(help="Kind of light, such as overcast or rain.")] = "clear"
+    host: Annotated[str, Option(help="Address to listen on.")] = "127.0.0.1"
+    port: Annotated[int, Option(help="Port to listen on; 0: any free port.", min=0, max=65535)] = (
+        8765
+    )
+    speed: Annotated[float, Option(help="Speed of the drive as a multiple of real time.")] = 1.0
+    seed: Annotated[int, Option(help="Seed of scenery, light and traffic.", min=0)] = 0
+    tracks_dir: TracksDir = None
 
 
-def watch(
-    track: Annotated[str, typer.Option(help="Name of a track, or its file.")] = WatchConfig.track,
-    lanes: Lanes = WatchConfig.lanes,
-    traffic: Traffic = WatchConfig.traffic,
-    light: Annotated[
-        str, typer.Option(help="Kind of light, such as overcast or rain.")
-    ] = WatchConfig.light,
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = WatchConfig.host,
-    port: Annotated[
-        int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)
-    ] = WatchConfig.port,
-    speed: Annotated[
-        float, typer.Option(help="Speed of the drive as a multiple of real time.")
-    ] = WatchConfig.speed,
-    seed: Annotated[
-        int, typer.Option(help="Seed of scenery, light and traffic.", min=0)
-    ] = WatchConfig.seed,
-    tracks_dir: TracksDir = WatchConfig.tracks_dir,
-) -> None:
+@options_of(WatchConfig)
+def watch(config: WatchConfig) -> None:
     """Watch a live drive in the browser, and take the wheel with the arrow keys.
 
     Shows several camera views, the plan of the track and the sensors. The first line on stderr is
     the address; this machine needs no display. Ctrl-C ends it.
     """
-    from simulator.watch.command import watch as run
+    from runtime.sockets import bind
+    from simulator.camera import check_light
+    from simulator.camera.core.context import graphics
+    from simulator.track.catalogue import find_track
+    from simulator.track.road import Road
+    from simulator.world.pace import check_speed
 
-    run(WatchConfig(track, lanes, traffic, light, host, port, speed, seed, tracks_dir))
+    road = Road(find_track(config.track, config.tracks_dir), config.lanes)
+    check_light(config.light)
+    check_speed(config.speed)
+    with bind(config.host, config.port) as listener:
+        listener.listen()
+        graphics()
+        _drive(road, config, listener)
+
+
+def _drive(road: "Road", config: WatchConfig, listener: socket.socket) -> None:
+    from runtime.signals import interrupts
+    from runtime.sockets import address
+    from simulator.watch.drive import Drive
+    from simulator.watch.hub import Hub
+    from simulator.watch.server import Server
+    from simulator.world.world import World
+
+    hub = Hub()
+    with World(road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ) as world:
+        drive = Drive(world, hub, light=config.light, seed=config.seed, speed=config.speed)
+        server = Server(hub, listener)
+        try:
+            server.start()
+            url = address(listener, config.host)
+            sys.stderr.write(f"watch {road.track.name} at {url} (Ctrl-C ends it)\n")
+            sys.stderr.flush()
+            with interrupts(signal.SIGINT) as interrupted:
+                while not interrupted():
+                    drive.advance()
+        finally:
+            server.stop()
+            drive.close()
+    raise KeyboardInterrupt

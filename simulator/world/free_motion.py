@@ -14,7 +14,7 @@ from simulator.track.piece_table import Table, locate
 from simulator.traffic.wreck import lane_motion
 from simulator.vehicle.dynamics import DT, MOTION, PIECE, Work, compute_forces_at, forget_turn
 from simulator.vehicle.orientation import fill_axes
-from simulator.vehicle.rigid_body import integrate_with
+from simulator.vehicle.rigid_body import integrate
 from simulator.vehicle.surface import Ground
 from simulator.world.boxes import BOX, box_radius, boxes_overlap, fill_car_box
 from simulator.world.walls import WallTable, fill_panel_box
@@ -22,33 +22,6 @@ from simulator.world.walls import WallTable, fill_panel_box
 
 @compiled
 def touches(
-    params: NDArray[Any],
-    other: NDArray[Any],
-    table: Table,
-    walls: WallTable,
-    motion: FloatArray,
-    piece: int,
-    others: FloatArray,
-    move: FloatArray,
-    share: float,
-    dt: float,
-    margin: float,
-) -> bool:
-    """Whether the ego car's box is within `margin` m of a wall or a traffic car.
-
-    params, other: `CarParameters.packed()` of the ego car and of a traffic car; others (n, 6):
-    ground poses of the traffic at the start of the control step of `dt` s; move (n, 6): their
-    change over it; share: fraction of the control step already done.
-    """
-    radius = box_radius(params[0]) + margin
-    at = locate(table, motion[0], motion[1], piece)
-    return touches_at(
-        params, other, table, walls, motion, at, others, move, share, dt, margin, radius
-    )
-
-
-@compiled
-def touches_at(
     params: NDArray[Any],
     other: NDArray[Any],
     table: Table,
@@ -62,8 +35,13 @@ def touches_at(
     margin: float,
     radius: float,
 ) -> bool:
-    """`touches` of a car whose position `at` (see `locate`) is already computed; radius: radius of
-    the car's box plus the margin."""
+    """Whether the ego car's box is within `margin` m of a wall or a traffic car.
+
+    params, other: `CarParameters.packed()` of the ego car and of a traffic car; at: the ego car's
+    position (see `locate`); others (n, 6): ground poses of the traffic at the start of the control
+    step of `dt` s; move (n, 6): their change over it; share: fraction of the control step already
+    done; radius: radius of the car's box plus the margin.
+    """
     _, s, d = at
     beside_wall = abs(d) > walls[0] - radius
     if not beside_wall and others.shape[0] == 0:
@@ -118,13 +96,13 @@ def advance_free(
         share, dt, radius = done / steps, steps * DT, own_radius + margin
         at = locate(table, motion[0], motion[1], int(memory[PIECE]))
         beside_wall = abs(at[2]) > walls[0] - radius
-        if (beside_wall or others.shape[0]) and touches_at(
+        if (beside_wall or others.shape[0]) and touches(
             params, other, table, walls, motion, at, others, move, share, dt, margin, radius
         ):
             return done
         fill_axes(motion[3:7], axes)
         compute_forces_at(p, table, ground, at, motion, memory, command, work)
-        integrate_with(p, axes, motion, wrench)
+        integrate(p, axes, motion, wrench)
         margin = 0.0
         done += 1
     return done

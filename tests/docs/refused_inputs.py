@@ -21,10 +21,11 @@ from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.index import open_round
 from mtlnet.calibration.config import CalibrateConfig
 from mtlnet.calibration.run import calibrate
-from mtlnet.data.custom_images import COLUMNS, open_custom_images
+from mtlnet.data.custom_images import open_custom_images
+from mtlnet.data.labels_file import COLUMNS
 from mtlnet.evaluation.protocol import drive_rows
 from mtlnet.inference.engine import Engine, load_engine
-from mtlnet.inference.image_decoding.decode import inspect, read_image
+from mtlnet.inference.image_decoding.decode import crop_and_resize, read_header, read_whole_image
 from mtlnet.inference.model_card import (
     SHIPPED,
     UNCERTAINTY_WEIGHTS,
@@ -73,7 +74,7 @@ def film(folder: Path, *arguments: str, name: str = "a.mp4") -> Path:
 
 
 def image(folder: Path, content: bytes) -> object:
-    return read_image(written(folder, "a.jpg", content), VIEW)
+    return crop_and_resize(read_whole_image(written(folder, "a.jpg", content)), VIEW)
 
 
 def camera_file(folder: Path, text: str) -> object:
@@ -147,10 +148,10 @@ TRIES: dict[str, Try] = {
     "to the service: two cameras": lambda folder: read_cameras(
         [f"a={written(folder, 'camera.yaml', b'fov_y_deg: 60')}"] * 2, VIEW
     ),
-    "to the service: another kind": lambda folder: inspect(b"BM" + bytes(100), VIEW),
-    "to the service: bytes behind": lambda folder: inspect(jpeg() + bytes(100), VIEW),
-    "to the service: over": lambda folder: inspect(jpeg(4000, 3000), VIEW),
-    "a missing file": lambda folder: read_image(folder / "none.jpg", VIEW),
+    "to the service: another kind": lambda folder: read_header(b"BM" + bytes(100)),
+    "to the service: bytes behind": lambda folder: read_header(jpeg() + bytes(100)),
+    "to the service: over": lambda folder: read_header(jpeg(4000, 3000)),
+    "a missing file": lambda folder: crop_and_resize(read_whole_image(folder / "none.jpg"), VIEW),
     "no film": lambda folder: read_film_header(written(folder, "a.mp4", b"no film at all")),
     "a film that breaks off": lambda folder: predict(
         halved(film(folder, "-c:v", "mpeg4", "-movflags", "faststart"))

@@ -41,6 +41,18 @@ def test_a_command_takes_the_dataclass_with_its_defaults() -> None:
     assert given == (Config(Path("x"), (4,), 0, True), "b")
 
 
+def test_a_command_that_computes_other_fields_takes_a_dictionary_of_all_options() -> None:
+    app, seen = typer.Typer(), []
+
+    @app.command()
+    @options_of(Config, make=dict)
+    def command(values: dict[str, Any]) -> None:
+        seen.append(Config(**values, kept=2.0))
+
+    assert CliRunner().invoke(app, ["--out", "x", "--batch", "8"]).exit_code == 0
+    assert seen == [Config(Path("x"), batch=8, kept=2.0)]
+
+
 def test_a_command_takes_only_the_options_that_were_given() -> None:
     assert answers(True) == ({}, "a")
     words = ("--out", "x", "--seeds", "4,5", "--batch", "0", "--dry")

@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.golden_image import golden_image
-from mtlnet.inference.image_decoding.decode import decode, inspect
+from mtlnet.inference.image_decoding.decode import crop_and_resize, decode_whole, read_header
 from mtlnet.inference.prediction import decode_outputs
 from serve.scheduling.warmup import TOLERANCE, warm_up
 from serve.shared_memory import create_shared_memory
@@ -145,7 +145,7 @@ def oracle(sensitive_model: Path) -> Engine:
 def model_input(image: bytes) -> NDArray[np.uint8]:
     """The pixels of an image file in the form that an engine receives."""
     camera = CameraParameters()
-    return decode(image, inspect(image, camera), camera)
+    return crop_and_resize(decode_whole(image, read_header(image)), camera)
 
 
 @pytest.mark.parametrize("precision", ["f32", "bf16"])

@@ -7,8 +7,8 @@ upright image. A wider image is cropped to the model's field of view
 (`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, 16 bits are reduced to
 8.
 
-A service accepts JPEG and PNG (`inspect`, `decode`). A file on this machine may be of another kind
-and is limited only by memory (`read_image`, `read_whole_image`, `decode_file`).
+A service accepts JPEG and PNG (`read_header`, `decode_whole`). A file on this machine may be of
+another kind and is limited only by memory (`read_whole_image`, `decode_file`).
 """
 
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ MAX_FILE_BYTES = 1 << 30
 MAX_FILE_PIXELS = 256_000_000  # in a file of this machine: 0.8 GB; the largest sensors have 200
 MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
 MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the largest image
-LATE_CHECK_BYTES = 1 << 18  # larger JPEG files are checked by `decode`
+LATE_CHECK_BYTES = 1 << 18  # larger JPEG files are checked by `decode_whole`
 # On one core at 2.6 GHz: 84 ns per pixel of a PNG with 64 bits per pixel, 10 of a baseline JPEG, 15
 # of one with ten scans.
 PNG_NS_PER_BIT, PNG_NS_PER_BYTE, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 2.0, 10.0, 1.0, 10
@@ -76,20 +76,12 @@ class ImageHeader:
         return self.width * self.height * per_pixel_ns / 1e6
 
 
-def read_image(
-    path: Path, view: CameraParameters, fov_y_deg: float | None = None
-) -> NDArray[np.uint8]:
-    """The image file at `path` as uint8 RGB (view.height, view.width, 3).
-
-    It is scaled, and cropped if it is wider than the view; `fov_y_deg` as in `inspect`. Raises
-    ImageError for an image that cannot be used, UserError for a file that is missing or too large.
-    """
-    with _named(path):
-        return crop_and_resize(decode_file(_read_file(path)), view, fov_y_deg)
-
-
 def read_whole_image(path: Path) -> NDArray[np.uint8]:
-    """The image file at `path` as uint8 RGB (H, W, 3). Raises as `read_image`."""
+    """The image file at `path` as uint8 RGB (H, W, 3).
+
+    Raises ImageError for an image that cannot be used, UserError for a file that is missing or too
+    large.
+    """
     with _named(path):
         return decode_file(_read_file(path))
 
@@ -148,22 +140,11 @@ def check_file_size(width: int, height: int) -> None:
         )
 
 
-def inspect(body: bytes, view: CameraParameters, fov_y_deg: float | None = None) -> ImageHeader:
-    """The header of an image, checked against all limits before decoding.
-
-    Takes a few ms at most; slower checks are left to `decode`.
-
-    `fov_y_deg`: vertical field of view of the image; None: the field of view of `view`. Raises
-    ImageError.
-    """
-    header = read_header(body)
-    crop_box(header.width, header.height, view, fov_y_deg)
-    return header
-
-
 def read_header(body: bytes) -> ImageHeader:
-    """The header of an image, checked against the limits of every camera; otherwise as `inspect`.
-    Raises ImageError."""
+    """The header of an image, checked against the limits of every camera before decoding.
+
+    Takes a few ms at most; slower checks are left to `decode_whole`. Raises ImageError.
+    """
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
         orientation = exif_orientation(png.find_exif(body))
@@ -225,8 +206,8 @@ def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
 
 
 def _check_late(body: bytes, header: ImageHeader) -> None:
-    """Make the checks that `inspect` left out. Raises ImageError, also where its estimate was too
-    low."""
+    """Make the checks that `read_header` left out. Raises ImageError, also where its estimate was
+    too low."""
     scans = _check_jpeg(body, header.width, header.height).scans
     if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
         raise ImageError(
@@ -255,16 +236,6 @@ def check_size(width: int, height: int) -> None:
             f"the image is {width} x {height} px; {MIN_SIDE_PX} to {MAX_SIDE_PX} px a side and at "
             f"most {MAX_PIXELS / 1e6:.1f} million px are accepted: scale it to the model's camera",
         )
-
-
-def decode(
-    body: bytes, header: ImageHeader, view: CameraParameters, fov_y_deg: float | None = None
-) -> NDArray[np.uint8]:
-    """The image as uint8 RGB (view.height, view.width, 3), cropped to the view and area-averaged.
-
-    `header` and `fov_y_deg` as in `inspect`. Raises ImageError.
-    """
-    return crop_and_resize(decode_whole(body, header), view, fov_y_deg)
 
 
 def decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:

@@ -39,7 +39,6 @@ class PngHeader:
 
     width: int
     height: int
-    colour_type: int
     pixel_bits: int
     interlaced: bool
     file_bytes: int
@@ -72,7 +71,7 @@ def read_header(body: bytes) -> PngHeader:
             "save it anew",
         )
     pixel_bits = depth * CHANNELS[colour]
-    return PngHeader(width, height, colour, pixel_bits, bool(interlace), len(body))
+    return PngHeader(width, height, pixel_bits, bool(interlace), len(body))
 
 
 def find_exif(body: bytes, *, limited: bool = True) -> bytes:

@@ -12,12 +12,11 @@ import numpy as np
 
 from mtlnet.sources.recordings.images import CALIBRATION, ROS_CALIBRATION
 from mtlnet.sources.recordings.topic import Topic
+from runtime.camera_file import read_distortion
 from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 
 CALIBRATIONS = (ROS_CALIBRATION, CALIBRATION)
-PINHOLE = ("plumb_bob", "rational_polynomial")
-FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
 RECTIFIED = "image_rect"
 """Part of the name of a topic whose pictures follow the projection matrix, without distortion (REP
 104)."""
@@ -81,15 +80,7 @@ def is_models(camera: CameraParameters, model: CameraParameters) -> bool:
 def _lens(model: str, distortion: Any) -> dict[str, Any]:
     if not distortion.any():
         return {"distortion": "none", "coefficients": ()}
-    used = distortion[:8] if not distortion[8:].any() else distortion
-    coefficients = tuple(used.tolist())
-    if model in PINHOLE:
-        return {"distortion": "opencv", "coefficients": coefficients}
-    if model in FISHEYE:
-        return {"distortion": "fisheye", "coefficients": coefficients}
-    raise UserError(
-        f"its distortion model {model!r} is not read; known are {', '.join((*PINHOLE, *FISHEYE))}"
-    )
+    return read_distortion(model, distortion.tolist())
 
 
 def _binning(message: Any) -> tuple[int, int]:

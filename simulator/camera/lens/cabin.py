@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
 from simulator.camera.scene.light import Light
-from simulator.varied.cabin import Cabin
-from simulator.varied.look import RoadLook
+from simulator.varied.look import Cabin, RoadLook
 
 REFERENCE_WIDTH = 280.0
 """Picture width (pixels) for which blurs and sizes are stated."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runtime.jit import compiled
 from simulator.arrays import FloatArray
 from simulator.camera.lens.cabin import REFERENCE_WIDTH
-from simulator.varied.cabin import Cabin
+from simulator.varied.look import Cabin
 
 Picture = NDArray[np.uint8]
 

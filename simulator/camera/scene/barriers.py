@@ -12,7 +12,7 @@ from simulator.camera.scene.road_mesh import RoadMesh
 from simulator.camera.scene.strips import Level, strip
 from simulator.camera.scene.themes import Theme
 from simulator.track.road import Road
-from simulator.varied.roadside import Roadside
+from simulator.varied.look import Roadside
 
 KINDS: tuple[str, ...] = (
     "rail", "wall", "hedge", "fence", "stones", "tyres", "crops", "bank", "none",

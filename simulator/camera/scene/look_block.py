@@ -7,10 +7,7 @@ from simulator.camera.scene.roadside import seen_road
 from simulator.camera.scene.themes import Colour
 from simulator.camera.scene.varied_light import lamp_colour
 from simulator.track.road import Road
-from simulator.varied.lighting import Lighting
-from simulator.varied.look import RoadLook
-from simulator.varied.paint import Paint
-from simulator.varied.surface import Surface
+from simulator.varied.look import Lighting, Paint, RoadLook, Surface
 
 MARKINGS, LINES = 4, 2
 """Largest number of markings of a road, and of lines of a marking, that the block holds."""

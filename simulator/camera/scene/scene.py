@@ -28,8 +28,7 @@ from simulator.camera.scene.themes import Colour, Theme, find_theme
 from simulator.camera.vegetation import scenery
 from simulator.camera.vegetation.trees import TreeMesh, VisibleTrees
 from simulator.track.road import Road
-from simulator.varied.look import RoadLook
-from simulator.varied.roadside import Roadside
+from simulator.varied.look import RoadLook, Roadside
 
 LAND = (
     land.Span(1, 0.0, 40.0, bare=False),

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from simulator.camera.scene.light import Colour, Light
-from simulator.varied.lighting import Lighting
+from simulator.varied.look import Lighting
 
 SUNNY = ("clear", "dusk", "heavy-shadow")
 """Kinds of light in which the sun may stand low."""

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from simulator.arrays import FloatArray
-from simulator.track.layout import Bend, Segment, Straight, close, cut, place
+from simulator.track.layout import Bend, Segment, Straight, close, cut, place, segment_length
 from simulator.track.random_roads.kinds import Kind
 
 MIN_STRAIGHT_M: Final = 1.0
@@ -176,7 +176,7 @@ def _tangents(corners: tuple[Corner, ...]) -> tuple[FloatArray, FloatArray]:
     """Lengths of the edges before and after it that each corner uses, two (n,) arrays."""
     bends: list[Segment] = [arc.bend() for corner in corners for arc in corner]
     placed = place(cut(bends))
-    lengths = [sum(_length(arc) for arc in corner) for corner in corners]
+    lengths = [sum(segment_length(arc.bend()) for arc in corner) for corner in corners]
     at = np.concatenate(([0.0], np.cumsum(lengths)))[:-1]
     first = np.searchsorted(placed.s0, at + 1e-6, side="right") - 1
     x = np.append(placed.x0[first], placed.end[0])
@@ -187,10 +187,6 @@ def _tangents(corners: tuple[Corner, ...]) -> tuple[FloatArray, FloatArray]:
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
     t_out = left / np.sin(turn)
     return ahead - t_out * np.cos(turn), t_out
-
-
-def _length(arc: Arc) -> float:
-    return arc.radius * math.radians(abs(arc.angle)) + arc.spiral
 
 
 def _closed(before: FloatArray, corners: tuple[Corner, ...]) -> Course:

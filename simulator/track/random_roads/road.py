@@ -8,14 +8,18 @@ the same decimals on every machine (numpy's PCG64; rounding to decimals removes 
 sines in the last bits). The hash of the track is the hash of these decimals.
 """
 
+import json
 import math
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from runtime.files import atomic_write
 from simulator.arrays import FloatArray
 from simulator.track.errors import UnknownTrack
 from simulator.track.geometry import Track
@@ -151,3 +155,22 @@ def _hills(kind: Kind, x: FloatArray, y: FloatArray, rng: np.random.Generator) -
         along = x * math.cos(direction) + y * math.sin(direction)
         height = height + np.sin(along * wave + phase) / wave
     return height
+
+
+def write_road(seed: int, path: Path) -> None:
+    """Write the road of `seed` as a TOML file, which reads back as the same track (see
+    `toml_track`). Raises UserError without the folder, OSError for a full disk."""
+    comment = f"# {random_name(seed)}: a random road of the kind {kind_of(seed).name}."
+    atomic_write(path, "\n".join([comment, *_lines(road_file(seed))]) + "\n")
+
+
+def _lines(content: Mapping[str, Any]) -> Iterator[str]:
+    """The lines of a TOML file; for plain strings, booleans and numbers its values are JSON's."""
+    for key, value in content.items():
+        if not isinstance(value, dict | list):
+            yield f"{key} = {json.dumps(value)}"
+    for key, value in content.items():
+        tables = value if isinstance(value, list) else [value] if isinstance(value, dict) else []
+        for table in tables:
+            yield from ("", f"[[{key}]]" if isinstance(value, list) else f"[{key}]")
+            yield from (f"{name} = {json.dumps(entry)}" for name, entry in table.items())

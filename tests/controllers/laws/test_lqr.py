@@ -23,7 +23,15 @@ from controllers.laws.lqr import (
     blend_for,
     next_rate,
 )
-from controllers.laws.lqr_gains import FASTEST_M_S, SLOWEST_M_S, LqrWeights, clqr, dlqr
+from controllers.laws.lqr_gains import (
+    FASTEST_M_S,
+    SLOWEST_M_S,
+    LqrWeights,
+    clqr,
+    discrete_gains,
+    dlqr,
+    row_at,
+)
 from controllers.laws.steering import STEERING_LOCK
 from controllers.laws.torcs_feedback import StateFeedback
 from controllers.perception.sources import truth
@@ -102,18 +110,18 @@ def test_continuous_regulator_of_an_integrator_has_the_closed_form_gain() -> Non
 )
 @pytest.mark.parametrize("dt", [0.02, 0.05, 0.1])
 def test_the_closed_loop_is_stable_at_every_speed(weights: LqrWeights, dt: float) -> None:
-    lqr = Lqr(dt, weights)
+    gains = discrete_gains(weights, dt)
     for speed in np.arange(5.0, 35.5, 0.5):  # also between the points of the grid
-        A, B = lqr.model.discretise(float(speed), dt)
-        loop = A - B @ lqr.gain(float(speed))[None, :]
+        A, B = LateralModel().discretise(float(speed), dt)
+        loop = A - B @ row_at(gains, float(speed))[None, :]
         assert np.abs(np.linalg.eigvals(loop)).max() < 0.999
 
 
 def test_gains_are_held_beyond_the_grid() -> None:
-    lqr = Lqr()
-    np.testing.assert_array_equal(lqr.gain(0.0), lqr.gain(SLOWEST_M_S))
-    np.testing.assert_allclose(lqr.gain(90.0), lqr.gain(FASTEST_M_S))
-    assert np.all(np.isfinite(lqr.gain(-2.0)))
+    gains = discrete_gains(WEIGHTS_EXACT, 0.05)
+    np.testing.assert_array_equal(row_at(gains, 0.0), row_at(gains, SLOWEST_M_S))
+    np.testing.assert_allclose(row_at(gains, 90.0), row_at(gains, FASTEST_M_S))
+    assert np.all(np.isfinite(row_at(gains, -2.0)))
 
 
 STATE_LAWS = ["lqr", "lqr-preview", "lqr-paper", "mpc", "mpc-preview", "torcs"]
@@ -225,10 +233,10 @@ def test_torcs_feedback_reproduces_recorded_steering(
 
 def test_lqr_without_preview_keeps_an_offset_in_a_bend_and_ignores_the_curvature() -> None:
     """In a steady bend -(K1 e1 + K3 e2) is the wheel angle that the bend needs."""
-    lqr, speed, curvature = Lqr(), 15.0, 1 / 80
+    speed, curvature = 15.0, 1 / 80
     offset = response(Lqr(), speed, curvature)[-1]
     wheel, heading = LateralModel().cornering(speed)
-    gain = lqr.gain(speed)
+    gain = row_at(discrete_gains(WEIGHTS_EXACT, 0.05), speed)
     assert offset == pytest.approx(-(wheel + gain[2] * heading) * curvature / gain[0], abs=2e-3)
     assert abs(offset) > 2e-3
     known = replace(STRAIGHT_AT_20, to_lane_centre=0.01, curvature=0.02)

@@ -163,7 +163,7 @@ def _drive(
             features = world.features()
             seen["bad"].append(bool(state.collision or state.off_track or state.backwards))
             seen["angle"].append(state.angle)
-            seen["error"].append(abs(state.to_middle - driver.target_offset))
+            seen["error"].append(abs(state.to_middle - (driver._steered_for or 0.0)))
             seen["speed_kmh"].append(state.speed_kmh)
             seen["in_lane"].append(features.ml is not None)
             seen["on_marking"].append(features.m is not None)

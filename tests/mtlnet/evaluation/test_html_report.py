@@ -183,7 +183,7 @@ def test_markings_are_drawn_where_they_are(
         (labels.distances[9, 0] + 1.0, labels.angle[9] + 0.002, PREDICTION_COLOUR),
     ):
         line = marking_line(float(distance), float(angle), float(labels.curvature[9]))
-        points = to_pixels(line, camera, camera.height_above_road_m)
+        points = to_pixels(line, camera)
         near = list(_inside(points, camera.width * 2, camera.height * 2))
         assert near
         for u, v in near:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from datagen.recording import Dataset
 from mtlnet.architecture import HEIGHT, WIDTH
@@ -84,7 +85,7 @@ def test_what_cannot_be_shipped(published: Path, shipped: Path) -> None:
     with pytest.raises(UserError, match="already holds a model"):
         ship_model(published, shipped)
     with pytest.raises(ModelError, match="fc0 holds a weight beyond float16"):
-        half("fc0", np.array([1.0, 7e4], np.float32))
+        half("fc0", torch.tensor([1.0, 7e4]))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,12 @@ import pytest
 import simplejpeg
 
 from mtlnet.inference.image_decoding.crop import Box, crop_box
-from mtlnet.inference.image_decoding.decode import LATE_CHECK_BYTES, decode, inspect
+from mtlnet.inference.image_decoding.decode import (
+    LATE_CHECK_BYTES,
+    crop_and_resize,
+    decode_whole,
+    read_header,
+)
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import read_head, read_structure
 from tests.mtlnet.inference.images import chunk, jpeg, picture, png
@@ -19,7 +24,7 @@ VIEW = CameraParameters()
 
 
 def pixels(body: bytes) -> np.ndarray:
-    return decode(body, inspect(body, VIEW), VIEW)
+    return crop_and_resize(decode_whole(body, read_header(body)), VIEW)
 
 
 def refusal(body: bytes) -> ImageError:
@@ -115,11 +120,13 @@ def test_a_wider_field_of_view_is_cropped_and_a_narrower_one_refused() -> None:
     """tan(67.5 / 2 deg) = 0.66818 of tan(45 deg): 210 rows seen with 67.5 are 314.3 with 90."""
     large = picture(420, 314)
     body = png(large[:, :, ::-1])
-    header = inspect(body, VIEW, 90.0)
-    assert np.array_equal(decode(body, header, VIEW, 90.0), large[52:262, 70:350])
+    header = read_header(body)
+    assert np.array_equal(
+        crop_and_resize(decode_whole(body, header), VIEW, 90.0), large[52:262, 70:350]
+    )
     assert crop_box(420, 314, VIEW, 90.0) == Box(70, 52, 280, 210)
     with pytest.raises(ImageError, match="50 degrees") as caught:
-        inspect(body, VIEW, 50.0)
+        crop_box(420, 314, VIEW, 50.0)
     assert caught.value.fault is Fault.FIELD_OF_VIEW
 
 
@@ -152,7 +159,7 @@ def test_the_size_of_a_large_jpeg_is_read_without_its_profile_and_tables() -> No
     description = read_head(large).description
     assert len(description) < 100
     assert simplejpeg.decode_jpeg_header(description) == simplejpeg.decode_jpeg_header(body)
-    header = inspect(large, VIEW)
+    header = read_header(large)
     assert (header.width, header.height, header.checked) == (400, 210, False)
     assert read_head(body[:2] + b"\xff\xd9").description == b"\xff\xd8\xff\xd9"
 

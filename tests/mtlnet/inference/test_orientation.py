@@ -14,9 +14,8 @@ from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.decode import (
     LATE_CHECK_BYTES,
     crop_and_resize,
-    decode,
-    inspect,
-    read_image,
+    decode_whole,
+    read_header,
     read_whole_image,
 )
 from mtlnet.inference.image_decoding.orientation import exif_orientation, read_tags
@@ -82,7 +81,7 @@ def stored(orientation: int, image: Pixels | None = None) -> Pixels:
 
 
 def by_service(body: bytes) -> Pixels:
-    return decode(body, inspect(body, VIEW), VIEW)
+    return crop_and_resize(decode_whole(body, read_header(body)), VIEW)
 
 
 @pytest.mark.parametrize("orientation", ALL)
@@ -98,14 +97,16 @@ def test_a_turned_jpeg_and_png_give_the_pixels_of_the_upright_one(
         for body in (in_png(image, block), in_png(image, block, at_end=True)):
             path.write_bytes(body)
             assert np.array_equal(by_service(body), expected)
-            assert np.array_equal(read_image(path, VIEW), expected)
+            assert np.array_equal(crop_and_resize(read_whole_image(path), VIEW), expected)
             assert np.array_equal(read_whole_image(path), picture())
         body = in_jpeg(image, block)
         path.write_bytes(body)
         whole = TURNS[orientation](simplejpeg.decode_jpeg(body))
         assert np.abs(whole.astype(int) - picture()).mean() < 2
         assert np.array_equal(by_service(body), crop_and_resize(whole, VIEW))
-        assert np.array_equal(read_image(path, VIEW), crop_and_resize(whole, VIEW))
+        assert np.array_equal(
+            crop_and_resize(read_whole_image(path), VIEW), crop_and_resize(whole, VIEW)
+        )
         assert np.array_equal(read_whole_image(path), whole)
 
 
@@ -127,7 +128,7 @@ def test_sizes_and_crops_are_those_of_the_upright_image(orientation: int) -> Non
         in_png(stored(orientation, image), exif(orientation)),
         in_jpeg(stored(orientation, image), exif(orientation)),
     ):
-        header = inspect(body, VIEW)
+        header = read_header(body)
         assert (header.width, header.height) == (640, 300)
         assert crop_box(header.width, header.height, VIEW) is not None
 
@@ -137,7 +138,7 @@ def test_a_large_jpeg_is_turned_too() -> None:
     noise = np.random.default_rng(1).integers(0, 256, (600, 800, 3), np.uint8)
     body = in_jpeg(stored(6, noise), exif(6))
     assert len(body) > LATE_CHECK_BYTES
-    header = inspect(body, VIEW)
+    header = read_header(body)
     assert (header.width, header.height, header.orientation) == (800, 600, 6)
     assert header.decode_ms == pytest.approx(800 * 600 * (10 + 6) / 1e6)
     whole = np.rot90(simplejpeg.decode_jpeg(body), -1)
@@ -153,10 +154,10 @@ def test_exif_is_found_behind_other_segments_and_the_first_one_counts() -> None:
         [segment(b"a comment", 0xFE)] * 5,
         [b"\xff\xff\xff", xmp],  # fill bytes
     ):
-        assert inspect(in_jpeg(image, exif(3), *before), VIEW).orientation == 3
+        assert read_header(in_jpeg(image, exif(3), *before)).orientation == 3
     twice = in_jpeg(image, exif(6), segment(b"Exif\0\0" + exif(3)))
-    assert inspect(twice, VIEW).orientation == 3
-    assert inspect(in_jpeg(image, b"", xmp), VIEW).orientation == 1  # XMP is not read
+    assert read_header(twice).orientation == 3
+    assert read_header(in_jpeg(image, b"", xmp)).orientation == 1  # XMP is not read
 
 
 @pytest.mark.parametrize(
@@ -182,7 +183,7 @@ def test_a_broken_orientation_counts_as_none(block: bytes) -> None:
     assert exif_orientation(block) == 1
     expected = crop_and_resize(picture(), VIEW)
     assert np.array_equal(by_service(in_png(picture(), block)), expected)
-    assert inspect(in_jpeg(picture(), block), VIEW).orientation == 1
+    assert read_header(in_jpeg(picture(), block)).orientation == 1
 
 
 def test_only_the_first_directory_is_read() -> None:

@@ -12,9 +12,8 @@ import simplejpeg
 
 from mtlnet.inference.image_decoding.decode import (
     crop_and_resize,
-    decode,
-    inspect,
-    read_image,
+    decode_whole,
+    read_header,
     read_whole_image,
 )
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
@@ -30,26 +29,26 @@ PNG = cv2.imencode(".png", NOISE)[1].tobytes()
 
 def fault(path: Path) -> Fault:
     with pytest.raises(ImageError, match=path.name) as caught:
-        read_image(path, VIEW)
+        read_whole_image(path)
     return caught.value.fault
 
 
 def test_a_file_gives_the_same_pixels_as_in_the_service(tmp_path: Path) -> None:
-    """Also a smaller image, which is scaled, and one whose name is not UTF-8."""
+    """Also a smaller image, and one whose name is not UTF-8."""
     small = simplejpeg.encode_jpeg(np.ascontiguousarray(NOISE[:105, :140]), 90)
     for body in (JPEG, PNG, small):
         path = tmp_path / os.fsdecode(b"caf\xe9.jpg")
         path.write_bytes(body)
-        assert np.array_equal(read_image(path, VIEW), decode(body, inspect(body, VIEW), VIEW))
+        assert np.array_equal(read_whole_image(path), decode_whole(body, read_header(body)))
 
 
 def test_a_missing_and_a_too_large_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no image file"):
-        read_image(tmp_path / "none.jpg", VIEW)
+        read_whole_image(tmp_path / "none.jpg")
     with (tmp_path / "huge.jpg").open("wb") as file:
         file.truncate((1 << 30) + 1)
     with pytest.raises(UserError, match=r"huge\.jpg has 1073741825 bytes"):
-        read_image(tmp_path / "huge.jpg", VIEW)
+        read_whole_image(tmp_path / "huge.jpg")
 
 
 SMOOTH = cv2.resize(NOISE[:7, :9], (280, 210), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
@@ -96,11 +95,11 @@ def test_what_opencv_reads_is_read_whatever_its_name(
     assert found.dtype == np.uint8
     assert found.shape == (210, 280, 3)
     assert np.abs(found[:, :, ::-1].astype(int) - SMOOTH).mean() <= tolerance
-    assert read_image(path, VIEW).shape == (210, 280, 3)
+    assert read_whole_image(path).shape == (210, 280, 3)
     path.write_bytes(body[: len(body) // 2])
     assert fault(path) is Fault.DAMAGED
     with pytest.raises(ImageError):
-        inspect(body, VIEW) if not body.startswith(PNG[:4]) else read_image(path, VIEW)
+        read_header(body) if not body.startswith(PNG[:4]) else read_whole_image(path)
 
 
 def test_a_cmyk_jpeg_and_a_jpeg_without_huffman_tables_are_read(tmp_path: Path) -> None:
@@ -123,9 +122,9 @@ def test_bytes_behind_an_image_do_not_matter_locally(behind: bytes, tmp_path: Pa
     path = tmp_path / "a"
     for body in (JPEG, PNG):
         path.write_bytes(body + behind)
-        assert np.array_equal(read_image(path, VIEW), decode(body, inspect(body, VIEW), VIEW))
+        assert np.array_equal(read_whole_image(path), decode_whole(body, read_header(body)))
     path.write_bytes(JPEG[:-2] + bytes(300) + JPEG[-2:] + bytes(50))  # padded before its end, too
-    assert np.array_equal(read_image(path, VIEW), simplejpeg.decode_jpeg(JPEG))
+    assert np.array_equal(read_whole_image(path), simplejpeg.decode_jpeg(JPEG))
     path.write_bytes(JPEG[: len(JPEG) // 2] + behind[:1000])
     assert fault(path) is Fault.DAMAGED
 
@@ -136,12 +135,12 @@ def test_a_photo_larger_than_the_service_takes_is_scaled(tmp_path: Path) -> None
     options: list[list[int]] = [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]]
     bodies = [encoded(".jpg", large, *each) for each in options]
     with pytest.raises(ImageError, match="4000 x 3000 px"):
-        inspect(bodies[0], VIEW)
+        read_header(bodies[0])
     for body in (*bodies, PNG[:33] + chunk(b"teXt", b"") * 3000 + PNG[33:]):
         (tmp_path / "a").write_bytes(body)
         whole = NOISE if body.startswith(PNG[:4]) else large
         expected = crop_and_resize(whole[:, :, ::-1], VIEW).astype(int)
-        assert np.abs(read_image(tmp_path / "a", VIEW) - expected).mean() < 2
+        assert np.abs(crop_and_resize(read_whole_image(tmp_path / "a"), VIEW) - expected).mean() < 2
 
 
 @pytest.mark.parametrize(
@@ -164,7 +163,7 @@ def test_a_size_that_does_not_fit_the_memory_is_refused_by_its_header(
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     (tmp_path / "a").write_bytes(body + bytes(100))
     with pytest.raises(ImageError, match=f"{size}.* 256 million px") as caught:
-        read_image(tmp_path / "a", VIEW)
+        read_whole_image(tmp_path / "a")
     assert caught.value.fault is Fault.SIZE
 
 
@@ -194,7 +193,7 @@ def test_a_kind_that_is_not_read_is_named(body: bytes, named: str, tmp_path: Pat
     with pytest.raises(ImageError, match=rf"a\.jpg: no image file \(JPEG, .*, but .*{named}"):
         read_whole_image(tmp_path / "a.jpg")
     with pytest.raises(ImageError, match=f"^no JPEG or PNG file, but .*{named}"):
-        inspect(body, VIEW)
+        read_header(body)
 
 
 def test_the_preview_in_a_raw_file_is_not_taken_for_the_photo(tmp_path: Path) -> None:

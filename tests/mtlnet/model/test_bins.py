@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.architecture import ABSENT_ABOVE, ANGLE_BINS, DISTANCE_BINS, GRID, grid_size
@@ -20,8 +21,9 @@ from mtlnet.model.bins import (
     normal_targets,
     read_scores,
 )
-from mtlnet.model.network import Network, fold, initialise, predict_images, run_network
+from mtlnet.model.network import Network, fold, initialise, predict_images
 from mtlnet.model.openvino_graph import TOLERANCE, build_feature_graph, build_graph
+from mtlnet.model.served import FitInputs
 from mtlnet.training.losses.bins import bins_loss
 from mtlnet.training.losses.multi_task import Losses
 from mtlnet.training.losses.task_weighting import TaskWeighting
@@ -34,6 +36,13 @@ CASES = [
     ((-0.8, 3.2, NAN, -0.8, 3.2), 0.3),
     ((NAN, NAN, NAN, 1.5, 5.4), 0.0),
 ]
+
+
+def absent_of(network: Network, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Probabilities of absence (N, 5) in torch."""
+    with torch.inference_mode():
+        x = network.forward_features(torch.from_numpy(frames))
+        return network.absent_probabilities(x).numpy()
 
 
 def coded_cases() -> torch.Tensor:
@@ -198,7 +207,7 @@ def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
     for count in (0, 3, 4):  # each as alone
         together = model(frames[:count])["absent"]
         np.testing.assert_allclose(together, absent[:count] or np.empty((0, 5)), atol=TOLERANCE)
-    np.testing.assert_allclose(absent, run_network(network, frames).absent, atol=TOLERANCE)
+    np.testing.assert_allclose(absent, absent_of(network, frames), atol=TOLERANCE)
 
 
 def test_the_graph_gives_the_probabilities_of_absence() -> None:
@@ -206,12 +215,11 @@ def test_the_graph_gives_the_probabilities_of_absence() -> None:
     with torch.no_grad():  # large scores of "absent", different for each image
         rows = network.get_parameter("heads.distance.weight")
         rows.view(len(tf.MARKINGS), DISTANCE_BINS + 1, -1)[:, -1] *= 5.0
-    answers = run_network(network, frames)
     found = run_graph(build_graph(network), "f32", frames)
     assert found.shape == (6, OUTPUTS + len(tf.MARKINGS))
     parts = split_outputs(found)
     assert parts.absent is not None
-    np.testing.assert_allclose(parts.absent, answers.absent, atol=TOLERANCE)
+    np.testing.assert_allclose(parts.absent, absent_of(network, frames), atol=TOLERANCE)
     np.testing.assert_array_equal(parts.absent[:, 0], parts.absent[:, 1])  # ml and mr
     assert np.ptp(parts.absent, axis=0).max() > 0.1
     assert parts.absent.max() > 0.5
@@ -226,8 +234,9 @@ def test_the_graph_reads_bins_as_torch_does() -> None:
     network, frames = fold(made()), images(12, 5)
     options = {"INFERENCE_PRECISION_HINT": "f32"}
     graph = openvino_core().compile_model(build_feature_graph(network), "CPU", options)
-    answers = run_network(network, frames)
-    inputs, expected = answers.uncertainty_inputs, answers.outputs
+    with torch.inference_mode():
+        found_by_torch = FitInputs(network)(torch.from_numpy(frames))
+    expected, inputs, _ = (each.numpy() for each in found_by_torch)
     found = [graph(frame[None]) for frame in frames]
     assert np.ptp(expected[:, :6], axis=0).max() > 0.05
     np.testing.assert_allclose([row[0][0] for row in found], expected, atol=TOLERANCE)

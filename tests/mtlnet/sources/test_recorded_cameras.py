@@ -76,7 +76,7 @@ def test_a_rectified_topic_has_the_projection_without_distortion(tmp_path: Path)
     ("camera", "message"),
     [
         (ros_camera(SIZE, (0.0, 0.0, 0.0, 0.0)), "not calibrated: its matrix K has no focal"),
-        (ros_camera(SIZE, MATRIX, "fisheye62", (1.0,)), "model 'fisheye62' is not read; known"),
+        (ros_camera(SIZE, MATRIX, "fisheye62", (1.0,)), "model is 'fisheye62'; known"),
         (ros_camera(SIZE, MATRIX, "plumb_bob", (1.0, 2.0)), "has 2 numbers; give 4 or 5 or 8"),
         (ros_camera(SIZE, MATRIX, roi=8), "a part .roi. or are binned"),
     ],

@@ -17,8 +17,9 @@ from mtlnet.inference.image_decoding.decode import (
     MAX_SCANNED_PX,
     PNG_NS_PER_BIT,
     PNG_NS_PER_BYTE,
-    decode,
-    inspect,
+    crop_and_resize,
+    decode_whole,
+    read_header,
 )
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.image_decoding.jpeg_structure import (
@@ -67,11 +68,11 @@ def test_a_png_of_many_chunks_is_refused_and_its_bytes_have_a_cost() -> None:
     small = png(picture())
     body = with_chunks(small, b"", 300)
     with pytest.raises(ImageError, match=r"the PNG has over \d+ chunks"):
-        decode(body, inspect(body, CARD.camera), CARD.camera)
+        decode_whole(body, read_header(body))
     padded = with_chunks(small, bytes(1000), 1000)
-    header = inspect(padded, CARD.camera)
-    assert decode(padded, header, CARD.camera).shape == (210, 280, 3)
-    more_ms = header.decode_ms - inspect(small, CARD.camera).decode_ms
+    header = read_header(padded)
+    assert crop_and_resize(decode_whole(padded, header), CARD.camera).shape == (210, 280, 3)
+    more_ms = header.decode_ms - read_header(small).decode_ms
     assert more_ms == pytest.approx(2e-6 * (len(padded) - len(small)), rel=1e-6)
 
 
@@ -80,9 +81,9 @@ def test_no_png_that_is_decoded_on_the_event_loop_holds_it() -> None:
     pixels = png(picture(640, 480))
     chunks = (SMALL_MS * 1e6 - 640 * 480 * 24 * PNG_NS_PER_BIT) / PNG_NS_PER_BYTE - len(pixels)
     body = with_chunks(pixels, bytes(1012), int(chunks / 1024))
-    header = inspect(body, CARD.camera)
+    header = read_header(body)
     assert SMALL_MS - 0.1 < header.decode_ms <= SMALL_MS
-    assert held_s(lambda: decode(body, header, CARD.camera)) < LOOP_S
+    assert held_s(lambda: crop_and_resize(decode_whole(body, header), CARD.camera)) < LOOP_S
 
 
 def test_a_long_accept_header_is_refused_unread(service: Served) -> None:
@@ -108,12 +109,12 @@ def test_both_searches_agree_on_what_ends_entropy_coded_data() -> None:
 
 def test_scans_times_pixels_are_limited() -> None:
     body = jpeg(np.full((2040, 4080, 3), 90, np.uint8))
-    assert inspect(body, CARD.camera, 90.0).scans == 1
+    assert read_header(body).scans == 1
     many = MAX_SCANNED_PX // (2040 * 4080) + 1
     repeated = body[:-2] + b"\xff\xda\x00\x02" * many + body[-2:]
     assert len(repeated) < WINDOW_BYTES
     with pytest.raises(ImageError, match="scans of 4080 x 2040 px"):
-        inspect(repeated, CARD.camera, 90.0)
+        read_header(repeated)
 
 
 def test_a_full_queue_reads_no_inference_request() -> None:
@@ -141,7 +142,7 @@ def post_from(address: str, service: Served, body: bytes) -> tuple[int, bytes]:
 
 def test_a_client_has_one_large_image_at_a_time() -> None:
     assert len(LARGE) < 100_000
-    assert inspect(LARGE, CARD.camera, 90.0).decode_ms > 500
+    assert read_header(LARGE).decode_ms > 500
     gate = Gate()
     with serving(gate.engine) as service, ThreadPoolExecutor(2) as pool:
         first = pool.submit(post_from, "127.0.0.2", service, LARGE)
@@ -278,14 +279,14 @@ def test_the_scans_of_a_large_file_are_checked_when_it_is_decoded() -> None:
     assert done
     for body, scans in ((jpeg(noise), 1), (progressive.tobytes(), 10)):
         assert len(body) > LATE_CHECK_BYTES
-        header = inspect(body, CARD.camera)
+        header = read_header(body)
         assert (header.checked, header.scans) == (False, scans)
-        assert decode(body, header, CARD.camera).shape == (210, 280, 3)
+        assert crop_and_resize(decode_whole(body, header), CARD.camera).shape == (210, 280, 3)
         with pytest.raises(ImageError, match="follow the end of the image"):
-            decode(body + b"x" * 100, header, CARD.camera)
+            decode_whole(body + b"x" * 100, header)
         with pytest.raises(ImageError, match="before its end marker"):
-            decode(body[:-2], header, CARD.camera)
+            decode_whole(body[:-2], header)
     body = jpeg(noise)
     many = body[:-2] + b"\xff\xda\x00\x02" * 4 + body[-2:]
     with pytest.raises(ImageError, match="5 scans, a sequential one has 4"):
-        decode(many, inspect(many, CARD.camera), CARD.camera)
+        decode_whole(many, read_header(many))

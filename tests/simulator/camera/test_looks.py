@@ -12,11 +12,7 @@ from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.varied.carriageway import Carriageway
-from simulator.varied.lens import Lens
-from simulator.varied.lighting import Lighting
-from simulator.varied.look import RoadLook
-from simulator.varied.roadside import Roadside
-from simulator.varied.surface import Surface
+from simulator.varied.look import Lens, Lighting, RoadLook, Roadside, Surface
 
 LIGHT = Light.named("clear", np.random.default_rng(1))
 OVERCAST = Light.named("overcast", np.random.default_rng(1))

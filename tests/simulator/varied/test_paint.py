@@ -11,8 +11,7 @@ from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.varied.carriageway import Carriageway, Line, Marking
-from simulator.varied.look import RoadLook
-from simulator.varied.paint import Paint
+from simulator.varied.look import Paint, RoadLook
 from trackfeatures.camera import CameraParameters
 
 WIDTH = 3.5

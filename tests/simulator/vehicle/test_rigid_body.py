@@ -10,6 +10,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.dynamics import MOTION, compute_forces
+from simulator.vehicle.orientation import rotation
 from simulator.vehicle.rigid_body import integrate
 from simulator.vehicle.state import Command
 from simulator.vehicle.surface import ground
@@ -43,7 +44,7 @@ def test_a_rotating_free_body_moves_as_in_pybullet() -> None:
         bullet.apply_wrench(bullet.cars[0], wrench, there)
         bullet.step()
         bullet.read(bullet.cars[0], there)
-        integrate(params[0], here, wrench.copy())
+        integrate(params[0], rotation(here[3:7]), here, wrench.copy())
     np.testing.assert_allclose(here, there, rtol=0.0, atol=1e-9)
     bullet.close()
 

@@ -12,12 +12,13 @@ from scipy.optimize import linprog
 
 from simulator.arrays import FloatArray
 from simulator.track.catalogue import find_track
+from simulator.track.piece_table import locate
 from simulator.track.road import Road
 from simulator.traffic.wreck import TRAFFIC_CAR
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.dynamics import DT, PIECE
 from simulator.vehicle.state import Collision, Command
-from simulator.world.boxes import AXES, BOX, HALF, boxes_overlap
+from simulator.world.boxes import AXES, BOX, HALF, box_radius, boxes_overlap
 from simulator.world.collisions import CONTACT_MARGIN_M, ContactPhysics
 from simulator.world.free_motion import touches
 from simulator.world.world import World
@@ -78,10 +79,11 @@ def test_box_overlap_equals_a_linear_program() -> None:
 
 def in_touch(world: World, others: FloatArray, move: FloatArray, share: float = 0.0) -> bool:
     contacts, motion = world._contacts, world._motion
-    other, piece = TRAFFIC_CAR.packed(), int(world._memory[PIECE])
+    other, radius = TRAFFIC_CAR.packed(), box_radius(world._params[0])
     table, walls = world.road.track.arrays(), contacts.walls.arrays
-    arguments = (world._params, other, table, walls, motion, piece, others, move, share, 0.05)
-    return bool(touches(*arguments, 0.0))
+    at = locate(table, motion[0], motion[1], int(world._memory[PIECE]))
+    arguments = (world._params, other, table, walls, motion, at, others, move, share, 0.05)
+    return bool(touches(*arguments, 0.0, radius))
 
 
 def test_a_touch_begins_where_bumpers_and_sides_meet() -> None:

@@ -11,10 +11,7 @@ from simulator.camera.lens.drops import Windscreen
 from simulator.camera.lens.imaging import ADAPTING_M, Imaging, adaptation
 from simulator.camera.scene.light import Light
 from simulator.camera.scene.varied_light import lit_as
-from simulator.varied.cabin import Cabin
-from simulator.varied.lens import Lens
-from simulator.varied.lighting import Lighting
-from simulator.varied.look import RoadLook
+from simulator.varied.look import Cabin, Lens, Lighting, RoadLook
 from trackfeatures.camera import CameraParameters
 
 WIDTH, HEIGHT = 280, 210
