@@ -36,7 +36,7 @@ Steps = Annotated[
     "Control steps of 50 ms. Default: the paper's number on its tracks, about a lap on other "
     "tracks.",
 ]
-MODELS = 'run folder, name in runs/, "latest", or "default" (the shipped model).'
+MODELS = 'run folder, name in runs/, "latest", or a shipped model: "default" or "varied".'
 Model = Annotated[str, f"Model of --perception model: {MODELS}"]
 Latency = Annotated[float, "Latency of the perception's answers, ms, 0 to 1000."]
 Drop = Annotated[float, "Share of the perception's answers that are lost, 0 to below 1."]

@@ -138,11 +138,14 @@ def write_page(
     """
     card, int8 = read_card(model), read_export(model / INT8) or {}
     found = [_read_evaluation(path, card) for path in evaluations]
+    tracks = [name for name in card.data["tracks"] if not name.startswith("random:")]
     environment = Environment(
         loader=PackageLoader("mtlnet.export", ""), undefined=StrictUndefined, autoescape=False
     )
     page = environment.get_template("model_page.md").render(
         card=card,
+        tracks=tracks,
+        random_roads=len(card.data["tracks"]) - len(tracks),
         notes=notes.strip(),
         gate=int8.get("gate") if int8.get("model_hash") == card.model_hash else None,
         evaluations=found,

@@ -24,12 +24,20 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
 SHIPPED_FILES = {
-    WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
-    GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
-    GRAPH_WEIGHTS: "c29fa70baad6ab421c4dcbd9d0dd9a25dfed741cf77b11d526ef2f08fbdd7208",
-    UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
+    "default": {
+        WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
+        GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
+        GRAPH_WEIGHTS: "c29fa70baad6ab421c4dcbd9d0dd9a25dfed741cf77b11d526ef2f08fbdd7208",
+        UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
+    },
+    "varied": {
+        WEIGHTS: "2ac2cd4e24ae98ba6ab029cc8cd6974b95ea00313a615f9fd1e76b58e846db8e",
+        GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
+        GRAPH_WEIGHTS: "ed15fca3e3c1e5f3c503dd18ec28a90c57c9fb249da7d56b78e6e88a510589dd",
+        UNCERTAINTY_WEIGHTS: "2042be0acae0688c300afcb1069cef27853c20fabd7c941e76bd6d159804ae3a",
+    },
 }
-"""SHA-256 of the shipped model's files."""
+"""SHA-256 of the files of each shipped model, by its name."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 6  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
 LISTING_FORMAT = 5
@@ -123,7 +131,8 @@ def read_card(run: Path) -> ModelCard:
     except (ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} is damaged ({error!r}); train the model anew") from error
     require_version(card.definitions_version, f"the model in {run}")
-    if run == SHIPPED and card.files != SHIPPED_FILES:
+    shipped = SHIPPED_FILES.get(run.name) if run.parent == SHIPPED.parent else None
+    if shipped is not None and card.files != shipped:
         raise ModelError(f"{run} does not hold the weights of this version; install again")
     return card
 
@@ -143,10 +152,11 @@ def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
 
 
 def resolve_run(name: str | Path, runs: Path = RUNS) -> Path:
-    """The folder of a run given as a path, a name in `runs/`, "latest" or "default".
+    """The folder of a run given as a path, a name in `runs/`, "latest", or a shipped model's name.
 
-    "default" is the model shipped with the project; without one, the latest run. Symbolic links are
-    resolved.
+    Shipped are "default" and "varied" (for real roads). Without a shipped "default", that name is
+    the latest run. A folder or a run of the name "varied" comes before the shipped model. Symbolic
+    links are resolved.
     """
     if str(name) == "default":
         if (SHIPPED / CARD).is_file():
@@ -158,9 +168,11 @@ def resolve_run(name: str | Path, runs: Path = RUNS) -> Path:
     for path in (given, runs / given):
         if path.is_dir():
             return path.resolve() if path.is_symlink() else path
+    if str(name) in SHIPPED_FILES:
+        return SHIPPED.parent / given
     raise ModelError(
-        f"there is no run {name} (looked for {given} and {runs / given}); train one "
-        "with `mtlnet train`, or give the folder of a run"
+        f"there is no run {name} (looked for {given} and {runs / given}); train one with `mtlnet "
+        f"train`, or give the folder of a run or a shipped model ({', '.join(SHIPPED_FILES)})"
     )
 
 

@@ -81,7 +81,8 @@ class TrainConfig:
     init: Annotated[
         str | None,
         Option(
-            help='Model to start from: "default" or a run.', show_default="none: random weights"
+            help="Model to start from: a run or a shipped model.",
+            show_default="none: random weights",
         ),
     ] = None
     seed: Annotated[int, Option(help="Seed of all random numbers.")] = 0

@@ -156,7 +156,9 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     assert {line.count("|") for line in rows} == {10, 12}, "every row has all its cells"
 
     assert "Before on" not in page
-    data = {**engine.card.data, "earlier": [{"frames": 250000, "content_hash": "c0ffee"}]}
+    earlier = [{"frames": 250000, "content_hash": "c0ffee"}]
+    tracks = ["oval", "random:12", "random:7", "town"]
+    data = {**engine.card.data, "tracks": tracks, "earlier": earlier}
     continued = tmp_path / "continued"
     shutil.copytree(shipped, continued)
     replace(engine.card, data=data).write(continued)
@@ -164,6 +166,7 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     (continued / INT8).mkdir(parents=True)
     write_export(continued / INT8, engine.card, (), gate=judged)
     page = write_page(continued, [file]).read_text()
+    assert "frames of the tracks oval, town and of 2 random roads (content hash" in page
     assert "Before on 250000 other frames (content hash `c0ffee`)." in page
     assert "It failed its accuracy gate: errors above those of float32, on 24 test frames." in page
     assert "| `ml` (m) | +0.0000 | 0.003 |\n| `mr` (m) |" in page
