@@ -63,7 +63,10 @@ def test_a_bag_states_matrix_and_distortion(
     path = bag(tmp_path / "bag", ros_camera(SIZE, MATRIX, model, distortion))
     found, line = open_recording(path).camera(MODEL)
     assert found == expected
-    assert "matrix and distortion come from /cam/camera_info, the mount is the model's (1.2 m above" in line
+    assert (
+        "matrix and distortion come from /cam/camera_info, the mount is the model's (1.2 m above"
+        in line
+    )
 
 
 def test_a_rectified_topic_has_the_projection_without_distortion(tmp_path: Path) -> None:
