@@ -148,9 +148,9 @@ class GuardedProtocol(HttpToolsProtocol):
             self._unread_bytes = self._known_bytes = 0
             self._phase = Phase.HEAD
         self.guard.reading = self
-        self._part_bytes = len(data)
-        self._part_requests = 0
+        self._part_bytes, self._part_requests = len(data), 0
         self._unread_bytes += self._part_bytes
+        upgrade_at = None
         try:
             upgrade_at = self.feed(data)
             if upgrade_at is not None:
@@ -164,14 +164,8 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_with(head_too_large())
         if self._settled is not self._phase:
             self._settle()
-        if len(data) >= guards.PAUSE_BYTES and not self.flow.read_paused:
-            self.flow.pause_reading()
-            self.loop.call_soon(self._read_on)
-
-    def _read_on(self) -> None:
-        """Read again after PAUSE_BYTES, unless something else has paused reading meanwhile."""
-        if not (self.transport.is_closing() or self.flow.write_paused or self.guard.holds(self)):
-            self.flow.resume_reading()
+        if upgrade_at is None:  # otherwise the WebSocket decides when to read
+            self.guard.pause_after(self, len(data))
 
     def feed(self, data: bytes) -> int | None:
         """Parse `data`. Returns the offset after the headers of a request with an upgrade, or None

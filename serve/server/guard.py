@@ -207,15 +207,25 @@ class ConnectionGuard:
         connection.flow.pause_reading()
         self.paused.append(connection)
 
-    def holds(self, connection: HttpToolsProtocol) -> bool:
-        """Whether `pause_reading` was called for the connection, and its time is not over."""
-        return connection in self.paused
+    def pause_after(self, connection: HttpToolsProtocol, size: int) -> None:
+        """Pause reading from a connection after a read of `size` bytes, if it is PAUSE_BYTES or
+        more, until the event loop has run its other work."""
+        if size >= PAUSE_BYTES and not connection.flow.read_paused:
+            connection.flow.pause_reading()
+            connection.loop.call_soon(self._read_on, connection)
 
     def _resume_reading(self) -> None:
         paused, self.paused = self.paused, []
         for connection in paused:
-            if not (connection.transport.is_closing() or connection.flow.write_paused):
-                connection.flow.resume_reading()
+            self._read_on(connection)
+
+    def _read_on(self, connection: HttpToolsProtocol) -> None:
+        """Resume reading, unless it is paused for another reason."""
+        flow = connection.flow
+        if not (
+            connection in self.paused or connection.transport.is_closing() or flow.write_paused
+        ):
+            flow.resume_reading()
 
 
 def _is_any_of(address: str, networks: Iterable[str]) -> bool:
