@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from controllers.drive.config import THROTTLE
 from controllers.drive.disturbance import ANGLE_NOISE_RAD, OFFSET_NOISE_M, SPEED_NOISE_M_S
 from controllers.laws.actor_state import HISTORY, HISTORY_STEPS, StateDefinition, history_state
+from controllers.rl import privileged
+from controllers.rl.privileged import privileged_state
 from simulator.env.reward import OFF_TRACK_REWARD, quadratic_reward
 from simulator.env.vector import LateralControlVector
 from simulator.track.catalogue import find_track
@@ -49,6 +51,8 @@ class Step:
 
     last: Array  # (N, size), the states after the step
     states: Array  # (N, size), the same, but the first states of new episodes
+    privileged: Array  # (N, privileged.SIZE), `privileged_state` before the step
+    last_privileged: Array  # (N, privileged.SIZE), the same after the step
     rewards: NDArray[np.float64]  # (N,)
     ended: NDArray[np.bool_]  # (N,), whether the episode reached a terminal state
     over: NDArray[np.bool_]  # (N,), whether it ended, also by its number of steps
@@ -104,12 +108,14 @@ class Cars:
         self._late = np.zeros((DELAYS, self.count, STATE_SIZE), np.float32)
         self._recent = np.zeros((self.count, HISTORY_STEPS, STATE_SIZE), np.float32)
         self._everyone = np.ones(self.count, np.bool_)
+        self._privileged = np.zeros((self.count, privileged.SIZE), np.float32)
 
     def reset(self, seed: int) -> Array:
         """Begin an episode of each car; all that follows depends on `seed` and the actions."""
         self._rng = np.random.default_rng(seed)
         observed, info = self._envs.reset(seed=seed)
         self._begin(self._everyone)
+        self._privileged = self._exact()
         return self._perceive(observed, info, self._everyone)
 
     def step(self, steering: Array) -> Step:
@@ -122,16 +128,26 @@ class Cars:
             running = quadratic_reward(offsets, info["angle"], steers, False)
             rewards = np.where(ended, OFF_TRACK_REWARD, running)
         last = states = self._perceive(observed, info, none)
+        privileged, self._privileged = self._privileged, self._exact()
+        last_privileged = self._privileged
         self._left -= 1
         over = ended | (self._left <= 0)
         if over.any():
             observed, info = self._envs.reset(options={"reset_mask": over})
             self._begin(over)
             states = np.where(over[:, None], self._perceive(observed, info, over), last)
-        return Step(last, states, rewards, ended, over, offsets)
+            self._privileged = np.where(over[:, None], self._exact(), last_privileged)
+        return Step(
+            *(last, states, privileged, last_privileged),
+            *(rewards, ended, over, offsets),
+        )
 
     def close(self) -> None:
         self._envs.close()
+
+    def _exact(self) -> Array:
+        throttle, fleet = self._actions[:, 1], self._envs.fleet
+        return privileged_state(fleet, throttle, self._delay, self._noise)
 
     def _begin(self, new: NDArray[np.bool_]) -> None:
         """Draw throttle, delay, noise and length of the episodes of the `new` cars (N,)."""

@@ -174,7 +174,7 @@ class TrainConfig:
         int | None,
         Option(
             help="Steps between two evaluations; a checkpoint is written after each. Default: "
-            "20,000 with one car, otherwise 500,000.",
+            "20,000 with one car, otherwise 1,000,000.",
             min=1,
         ),
     ] = None
@@ -199,7 +199,7 @@ def resolve(config: TrainConfig) -> TrainConfig:
         "envs": 256 if many else 1,
         "track": ALL_TRACKS if many else "forza",
         "steps": 20_000_000 if many else 400_000,
-        "evaluate_every": 500_000 if many else 20_000,
+        "evaluate_every": 1_000_000 if many else 20_000,
     }
     missing = {name: value for name, value in defaults.items() if getattr(config, name) is None}
     return replace(config, **missing)

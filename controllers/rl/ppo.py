@@ -10,6 +10,7 @@ standard deviation that does not depend on the state. Advantages are generalised
 - Advantages are divided by their mean distance from their mean, not by their standard deviation,
   and limited to 4 times it: an end costs hundreds of times as much as a usual step, and would hide
   all others.
+- The critic also receives the exact state and the road ahead (`privileged`).
 - The standard deviation is at least LEAST_STD.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
   there is no bonus for entropy.
@@ -28,6 +29,7 @@ from torch import Tensor, nn
 
 from controllers.laws.actor import NAMES, mirror_of
 from controllers.laws.actor_state import StateDefinition
+from controllers.rl import privileged
 from controllers.rl.cars import Array, Step
 from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import PpoSettings
@@ -84,7 +86,8 @@ def log_density(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
 
 
 class Policy(nn.Module):
-    """The actor with its standard deviation, and the critic, for scaled states (B, size)."""
+    """The actor with its standard deviation, for scaled states (B, size), and the critic, for these
+    and privileged states (B, size + privileged.SIZE)."""
 
     def __init__(
         self, definition: StateDefinition, settings: PpoSettings, generator: torch.Generator
@@ -92,18 +95,23 @@ class Policy(nn.Module):
         super().__init__()
         order, signs = mirror_of(definition)
         self._order, self._signs = torch.from_numpy(order), torch.from_numpy(signs)
-        self.actor = _layers(definition.size, settings.hidden, 0.01, generator)
-        self.critic = _layers(definition.size, settings.hidden, 1.0, generator)
+        size, hidden = definition.size, settings.hidden
+        self.actor = _layers(size, hidden, 0.01, generator)
+        self.critic = _layers(size + privileged.SIZE, hidden, 1.0, generator)
         self.log_std = nn.Parameter(torch.tensor(math.log(settings.first_std)))
 
     def mean(self, states: Tensor) -> Tensor:
         """The mean actions (B,), in (-1, 1)."""
-        mirrored = states[:, self._order] * self._signs
-        out = torch.tanh(self.actor(torch.cat((states, mirrored))).squeeze(1))
-        return 0.5 * (out[: len(states)] - out[len(states) :])
+        first, second, last = (layer for layer in self.actor if isinstance(layer, nn.Linear))
+        # The same layer for the mirror images of the states is computed beside it.
+        mirrored = (first.weight * self._signs)[:, self._order]
+        weight, bias = torch.cat((first.weight, mirrored)), first.bias.repeat(2)
+        hidden = nn.functional.linear(states, weight, bias).relu().view(-1, len(first.bias))
+        out = torch.tanh(last(second(hidden).relu())).view(-1, 2)
+        return 0.5 * (out[:, 0] - out[:, 1])
 
     def value(self, states: Tensor) -> Tensor:
-        """The values (B,)."""
+        """The values (B,) of scaled states with privileged states."""
         values: Tensor = self.critic(states).squeeze(1)
         return values
 
@@ -123,7 +131,8 @@ def _layers(
 
 @dataclass
 class Rollout:
-    """The last T steps of N cars, (T, N) and (T, N, size)."""
+    """The last T steps of N cars, (T, N) and, for the scaled states with the privileged states,
+    (T, N, size + privileged.SIZE)."""
 
     states: Array
     last: Array
@@ -134,7 +143,7 @@ class Rollout:
 
     @classmethod
     def empty(cls, horizon: int, cars: int, size: int) -> "Rollout":
-        states, last = np.zeros((2, horizon, cars, size), np.float32)
+        states, last = np.zeros((2, horizon, cars, size + privileged.SIZE), np.float32)
         actions, rewards = np.zeros((2, horizon, cars), np.float32)
         ended, over = np.zeros((2, horizon, cars), np.bool_)
         return cls(states, last, actions, rewards, ended, over)
@@ -152,7 +161,7 @@ class Ppo:
         self._actor = [*self.policy.actor.parameters(), self.policy.log_std]
         self._critic = list(self.policy.critic.parameters())
         self._adam = torch.optim.Adam(
-            [{"params": self._actor}, {"params": self._critic}], eps=ADAM_EPSILON
+            [{"params": self._actor}, {"params": self._critic}], eps=ADAM_EPSILON, fused=True
         )
         self.divisor = np.array(definition.spread, np.float32)
         self._rollout = Rollout.empty(self.horizon, cars, definition.size)
@@ -178,8 +187,9 @@ class Ppo:
         `left`: share of the training that is left.
         """
         of, row, k = self.settings, self._rollout, self._filled
-        row.states[k], row.actions[k] = states / self.divisor, actions
-        row.last[k] = step.last / self.divisor
+        row.states[k] = np.hstack((states / self.divisor, step.privileged))
+        row.last[k] = np.hstack((step.last / self.divisor, step.last_privileged))
+        row.actions[k] = actions
         end = of.reward_baseline * of.discount / (1.0 - of.discount)
         row.rewards[k] = of.reward_scale * (step.rewards - of.reward_baseline - end * step.ended)
         row.ended[k], row.over[k] = step.ended, step.over
@@ -195,12 +205,12 @@ class Ppo:
 
     def _update(self, rng: np.random.Generator) -> dict[str, float]:
         of, row = self.settings, self._rollout
-        shape, size = row.actions.shape, row.states.shape[2]
-        states = torch.from_numpy(row.states.reshape(-1, size))
+        shape = row.actions.shape
+        states = torch.from_numpy(row.states.reshape(-1, row.states.shape[2]))
         actions = torch.from_numpy(row.actions.reshape(-1))
         with torch.no_grad():
             values = self.policy.value(states)
-            before = log_density(actions, self.policy.mean(states), self.policy.log_std)
+            before = log_density(actions, self._means(states), self.policy.log_std)
             next_values = self._next_values(values.numpy().reshape(shape))
         advantages = advantages_of(
             row.rewards,
@@ -213,12 +223,12 @@ class Ppo:
         )
         gained = torch.from_numpy(advantages.reshape(-1))
         returns = gained + values
+        targets = torch.stack((actions, before, gained, returns), dim=1)
         losses = []
         for _ in range(of.epochs):
             order = torch.from_numpy(rng.permutation(len(states)))
-            for chosen in order.chunk(of.minibatches):
-                batch = states[chosen], actions[chosen], before[chosen]
-                losses.append(self._descend(*batch, gained[chosen], returns[chosen]))
+            batches = (part[order].chunk(of.minibatches) for part in (states, targets))
+            losses += [self._descend(*batch) for batch in zip(*batches, strict=True)]
         actor, critic, kl = np.mean(losses, axis=0).tolist()
         explained = 1.0 - float((returns - values).var() / (returns.var() + 1e-8))
         return {
@@ -241,13 +251,20 @@ class Ppo:
         found[asked] = self.policy.value(torch.from_numpy(row.last[asked])).numpy()
         return found
 
-    def _descend(
-        self, states: Tensor, actions: Tensor, before: Tensor, gained: Tensor, returns: Tensor
-    ) -> tuple[float, float, float]:
+    def _means(self, states: Tensor) -> Tensor:
+        """The mean actions (B,) for states with privileged states."""
+        return self.policy.mean(states[:, : len(self.divisor)])
+
+    def _descend(self, states: Tensor, targets: Tensor) -> tuple[float, float, float]:
         """One step on a minibatch; returns the losses and the mean divergence from the policy
-        before the update."""
+        before the update.
+
+        `targets` (B, 4): the action, the logarithm of its density before the update, its advantage,
+        and the return.
+        """
         of, policy = self.settings, self.policy
-        log_ratio = log_density(actions, policy.mean(states), policy.log_std) - before
+        actions, before, gained, returns = targets.unbind(1)
+        log_ratio = log_density(actions, self._means(states), policy.log_std) - before
         actor = clipped_loss(log_ratio, scaled(gained), of.clip)
         critic = 0.5 * ((policy.value(states) - returns) ** 2).mean()
         self._adam.zero_grad(set_to_none=True)

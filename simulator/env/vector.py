@@ -34,7 +34,7 @@ from simulator.env.vector_info import vector_info
 from simulator.env.vector_observer import VectorObserver
 from simulator.env.vector_pictures import checked_workers
 from simulator.env.view_renderer import RenderOptions
-from simulator.world.fleet import COMMAND_AT, STEPS
+from simulator.world.fleet import COMMAND_AT, STEPS, Fleet
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
@@ -132,6 +132,11 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         """The world of the present episode of a car."""
         return self._cars.world(number)
 
+    @property
+    def fleet(self) -> Fleet:
+        """All cars and their roads as arrays, which `step` and `reset` overwrite."""
+        return self._cars.fleet
+
     def reset(
         self,
         *,
@@ -145,8 +150,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             raise UserError("this environment is closed; make a new one")
         given = reset_options(options)
         chosen = self._mask(given.pop(MASK, None))
-        seeds = self._seeds(seed)
-        starts = self._starts(given)
+        seeds, starts = self._seeds(seed), self._starts(given)
         for number in np.flatnonzero(chosen).tolist():
             with naming_car(number, self.num_envs):
                 self._cars.drives[number].check(starts[number])
@@ -176,8 +180,8 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         terminated = cars.results[:, ENDED] > 0.0
         truncated = moving & (cars.fleet.cars[:, STEPS] >= self._max_steps)
         self._over = terminated | truncated
-        observed = self._observe(np.ones(self.num_envs, np.bool_))
         everyone = np.ones(self.num_envs, np.bool_)
+        observed = self._observe(everyone)
         if self.autoreset_mode != AutoresetMode.SAME_STEP or not self._over.any():
             return observed, rewards, terminated, truncated, self._info(everyone)
         last = self._last(observed)
@@ -189,9 +193,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
 
     def render(self) -> tuple[Any, ...]:
         """`render_view` (H, W, 3) of each car with `render_mode="rgb_array"`, else Nones."""
-        if self.render_mode is None:
-            return (None,) * self.num_envs
-        return self._observer.frames()
+        return self._observer.frames() if self.render_mode else (None,) * self.num_envs
 
     def close_extras(self, **kwargs: Any) -> None:
         self._rngs = []

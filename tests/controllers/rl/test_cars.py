@@ -8,6 +8,7 @@ import pytest
 from controllers.interface import Observation
 from controllers.laws.actor_state import PAPER, STATES, StateBuilder, StateDefinition, paper_state
 from controllers.rl import cars as module
+from controllers.rl import privileged
 from controllers.rl.cars import PERCEIVED, Cars, random_cars
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
@@ -172,3 +173,38 @@ def test_cars_are_spread_over_tracks_random_roads_and_disturbances() -> None:
     assert cars._disturbed.sum() == 6
     assert cars._disturbed[::2].sum() == cars._disturbed[1::2].sum() == 3
     cars.close()
+
+
+def test_the_privileged_state_is_the_truth_before_and_after_a_step() -> None:
+    """The critic's numbers are those of the world, however late and noisy the actor's are."""
+    cars = oval(6, disturbed=True, starts=START | {"s": (0.0, 1400.0)}, episode=(8, 12))
+    cars.reset(3)
+    before, over = None, np.zeros(6, np.bool_)
+    drawn = set()
+    for k in range(25):
+        step = cars.step(np.full(6, 0.1 * np.sin(k), np.float32))
+        if before is not None:
+            np.testing.assert_array_equal(step.privileged[~over], before[~over])
+            assert (step.privileged[over] != before[over]).any(axis=1).all()
+        over, before = step.over, step.last_privileged
+        for number in np.flatnonzero(~over).tolist():
+            world = cars._envs.world(number)
+            now, road, car = world.state, world.road, world.car
+            exact = dict(zip(privileged.PARTS, before[number] * privileged.SPREAD, strict=True))
+            assert exact["d"] == pytest.approx(now.to_middle, abs=1e-5)
+            assert exact["angle"] == pytest.approx(now.angle, abs=1e-6)
+            speeds = (exact["v_x"], exact["v_y"], exact["yaw_rate"])
+            assert speeds == pytest.approx((now.vx, now.vy, now.yaw_rate), abs=1e-5)
+            assert exact["steering"] == pytest.approx(0.1 * np.sin(k), abs=1e-6)
+            assert exact["half_width"] == pytest.approx(road.half_width)
+            curvatures = [road.track.curvature(now.s + far) for far in privileged.AHEAD_M]
+            found = [exact[f"curvature_{far:g}"] for far in privileged.AHEAD_M]
+            assert found == pytest.approx(curvatures, abs=1e-7)
+            assert exact["mass"] == pytest.approx(car.mass / 1150.0 - 1.0, abs=1e-5)
+            assert exact["friction"] == pytest.approx(car.friction / 1.6 - 1.0, abs=1e-5)
+            assert 0.0 <= exact["throttle"] <= 0.1
+            assert 0.0 <= exact["noise"] <= 1.0
+            drawn.add((round(exact["delay"]), any(curvatures)))
+    cars.close()
+    assert {delay for delay, _ in drawn} == {0, 1, 2}
+    assert {bend for _, bend in drawn} == {True, False}

@@ -9,6 +9,7 @@ import pytest
 
 from controllers.laws.actor import Actor, ActorCard
 from controllers.laws.actor_state import HISTORY, PAPER, STATES
+from controllers.rl import privileged
 from controllers.rl.cars import Step
 from controllers.rl.config import PpoSettings
 
@@ -103,8 +104,15 @@ def test_the_actors_file_steers_as_the_policy(name: str) -> None:
     assert actions == pytest.approx(-ppo.act(mirrored), abs=1e-6)
 
 
-def step_of(states: np.ndarray, rewards: np.ndarray, ended: np.ndarray) -> Step:
-    return Step(states, states, rewards, ended, ended, np.zeros(len(states)))
+def step_of(
+    states: np.ndarray,
+    rewards: np.ndarray,
+    ended: np.ndarray,
+    exact: np.ndarray | None = None,
+) -> Step:
+    if exact is None:
+        exact = np.zeros((len(states), privileged.SIZE), np.float32)
+    return Step(states, states, exact, exact, rewards, ended, ended, np.zeros(len(states)))
 
 
 def test_ppo_learns_the_best_action_of_a_bandit() -> None:
@@ -131,6 +139,20 @@ def test_ppo_learns_the_best_action_of_a_bandit() -> None:
     assert figures["reward"] > 0.9
 
 
+def test_the_critic_knows_what_the_actor_does_not_see() -> None:
+    """Each step is an episode, whose reward is a number of the privileged state alone."""
+    cars, rng = 64, np.random.default_rng(0)
+    settings = replace(PpoSettings(), horizon=16, minibatches=4, reward_baseline=0.0)
+    ppo = Ppo(settings, PAPER, cars, 0)
+    states, ended = np.zeros((cars, 7), np.float32), np.ones(cars, np.bool_)
+    figures: dict[str, float] = {}
+    for _ in range(16 * 10):
+        exact = rng.normal(size=(cars, privileged.SIZE)).astype(np.float32)
+        step = step_of(states, exact[:, 9].astype(float), ended, exact)
+        figures = ppo.learn(states, ppo.explore(states, rng), step, rng, 1.0) or figures
+    assert figures["explained_variance"] > 0.95
+
+
 def test_a_terminal_state_costs_the_baseline_for_ever() -> None:
     ppo = Ppo(PpoSettings(discount=0.9, reward_baseline=1.0, reward_scale=2.0), PAPER, 2, 0)
     states = np.zeros((2, 7), np.float32)
@@ -147,7 +169,8 @@ def test_a_cut_episode_continues_with_the_value_of_its_last_state() -> None:
     values = RNG.normal(size=(3, 2)).astype(np.float32)
     with torch.no_grad():
         found = ppo._next_values(values)
-        of_last = ppo.policy.value(torch.from_numpy(rollout.last.reshape(-1, 7))).reshape(3, 2)
+        last = torch.from_numpy(rollout.last.reshape(6, -1))
+        of_last = ppo.policy.value(last).reshape(3, 2)
     assert found[0, 0] == values[1, 0]
     assert found[1].tolist() == values[2].tolist()
     assert found[0, 1] == pytest.approx(of_last[0, 1].item(), abs=1e-6)

@@ -131,7 +131,7 @@ def test_defaults_that_depend_on_the_number_of_cars() -> None:
     one, many = resolve(TrainConfig()), resolve(TrainConfig(algorithm="ppo"))
     assert (one.envs, one.track, one.steps, one.evaluate_every) == (1, "forza", 400_000, 20_000)
     assert (many.envs, many.track) == (256, "all")
-    assert (many.steps, many.evaluate_every) == (20_000_000, 500_000)
+    assert (many.steps, many.evaluate_every) == (20_000_000, 1_000_000)
     assert resolve(TrainConfig(envs=64)).track == "all"
     assert resolve(TrainConfig(envs=64, steps=5)).steps == 5
 

@@ -1,0 +1,91 @@
+"""The privileged state: numbers of each car that PPO's critic receives beside the actor's state.
+
+A critic is needed in a training only, so that it may know more than the actor (an asymmetric
+actor-critic: Pinto et al. 2018). The actor's state is noisy and late, and does not contain the
+curvature of the road. A critic of this state would blame an action for the bend that follows it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.drive.config import THROTTLE
+from runtime.jit import compiled
+from simulator.arrays import FloatArray
+from simulator.track.piece_table import CURVATURE, index_near
+from simulator.vehicle.car import CarParameters
+from simulator.vehicle.dynamics import PIECE
+from simulator.vehicle.track_state import ANGLE, TRACK_OFFSET, TRACK_S, VX, VY, YAW_RATE
+from simulator.world.fleet import (
+    COMMAND_AT,
+    HALF_WIDTH,
+    MEMORY_AT,
+    ROAD,
+    TABLE_BEGIN,
+    TABLE_END,
+    TRACK_AT,
+    Fleet,
+)
+
+AHEAD_M = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0)
+"""Distances from the car, along the road, of the curvatures."""
+PARTS = (
+    *("d", "angle", "v_x", "v_y", "yaw_rate", "steering", "half_width"),
+    *(f"curvature_{ahead:g}" for ahead in AHEAD_M),
+    *("friction", "mass", "throttle", "delay", "noise"),
+)
+"""Names of the numbers. Throttle is the difference from the usual one; friction and mass are
+relative differences from the usual car."""
+SPREAD = np.array(
+    (
+        *(0.5, 0.04, 20.0, 0.8, 0.4, 0.3, 5.5),
+        *((0.02,) * len(AHEAD_M)),
+        *(0.2, 0.15, 0.1, 1.0, 1.0),
+    ),
+    np.float32,
+)
+"""Typical size of each number, by which it is divided."""
+SIZE = len(PARTS)
+FRICTION_AT = PARTS.index("friction")
+_AHEAD = np.array(AHEAD_M)
+
+
+def privileged_state(
+    fleet: Fleet,
+    throttle: NDArray[np.float64],
+    delay: NDArray[np.int64],
+    noise: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """The privileged states (N, SIZE) of the cars of `fleet`, divided by SPREAD.
+
+    `throttle` in [0, 1], `delay` in control steps, `noise` as a share of its largest standard
+    deviation: arrays (N,).
+    """
+    found = np.zeros((len(fleet.cars), SIZE), np.float32)
+    cars, _, _, tables, _, _, roads, _, _ = fleet.arrays
+    _fill(cars, tables, roads, _AHEAD, found)
+    friction = fleet.params["friction"] / CarParameters.friction - 1.0
+    mass = fleet.params["mass"] / CarParameters.mass - 1.0
+    for k, column in enumerate((friction, mass, throttle - THROTTLE, delay, noise)):
+        found[:, FRICTION_AT + k] = column
+    return found / SPREAD
+
+
+@compiled
+def _fill(
+    cars: FloatArray,
+    tables: FloatArray,
+    roads: FloatArray,
+    ahead: FloatArray,
+    out: NDArray[np.float32],
+) -> None:
+    for number in range(len(cars)):
+        car, row = cars[number], out[number]
+        road, track = roads[int(car[ROAD])], car[TRACK_AT:]
+        row[0], row[1] = track[TRACK_OFFSET], track[ANGLE]
+        row[2], row[3], row[4] = track[VX], track[VY], track[YAW_RATE]
+        row[5], row[6] = car[COMMAND_AT], road[HALF_WIDTH]
+        table = tables[int(road[TABLE_BEGIN]) : int(road[TABLE_END])]
+        piece = int(car[MEMORY_AT + PIECE])
+        for k in range(len(ahead)):
+            piece = index_near(table, track[TRACK_S] + ahead[k], piece)
+            row[7 + k] = table[piece, CURVATURE]
