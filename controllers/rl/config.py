@@ -179,7 +179,12 @@ class TrainConfig:
         ),
     ] = None
     threads: Annotated[
-        int, Option(help="Threads of the vector environment and of torch.", min=1)
+        int,
+        Option(
+            help="Threads that move several cars and train the networks of ppo. The actor does not "
+            "depend on it.",
+            min=1,
+        ),
     ] = 2
     tracks_dir: options.TracksDir = None
     resume: Annotated[

@@ -18,6 +18,8 @@ standard deviation that does not depend on the state. Advantages are generalised
 """
 
 import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -153,16 +155,25 @@ class Ppo:
     """The learner: `explore` and `learn` are called in turn, once for each step of the cars."""
 
     def __init__(
-        self, settings: PpoSettings, definition: StateDefinition, cars: int, seed: int
+        self,
+        settings: PpoSettings,
+        definition: StateDefinition,
+        cars: int,
+        seed: int,
+        threads: int = 1,
     ) -> None:
+        """With 2 threads or more, actor and critic are updated at the same time; the networks do
+        not depend on it."""
         self.settings, self.odd = settings, True
         self.horizon = settings.horizon
         self.policy = Policy(definition, settings, torch.Generator().manual_seed(seed))
         self._actor = [*self.policy.actor.parameters(), self.policy.log_std]
         self._critic = list(self.policy.critic.parameters())
-        self._adam = torch.optim.Adam(
-            [{"params": self._actor}, {"params": self._critic}], eps=ADAM_EPSILON, fused=True
-        )
+        self._adams = [
+            torch.optim.Adam(part, eps=ADAM_EPSILON, fused=True)
+            for part in (self._actor, self._critic)
+        ]
+        self._beside = ThreadPoolExecutor(1) if threads > 1 else None
         self.divisor = np.array(definition.spread, np.float32)
         self._rollout = Rollout.empty(self.horizon, cars, definition.size)
         self._filled = 0
@@ -197,10 +208,8 @@ class Ppo:
         if self._filled:
             return {}
         share = of.rate_end + (1.0 - of.rate_end) * left
-        for group, rate in zip(
-            self._adam.param_groups, (of.actor_rate, of.critic_rate), strict=True
-        ):
-            group["lr"] = rate * share
+        for adam, rate in zip(self._adams, (of.actor_rate, of.critic_rate), strict=True):
+            adam.param_groups[0]["lr"] = rate * share
         return self._update(rng)
 
     def _update(self, rng: np.random.Generator) -> dict[str, float]:
@@ -223,13 +232,15 @@ class Ppo:
         )
         gained = torch.from_numpy(advantages.reshape(-1))
         returns = gained + values
-        targets = torch.stack((actions, before, gained, returns), dim=1)
-        losses = []
-        for _ in range(of.epochs):
-            order = torch.from_numpy(rng.permutation(len(states)))
-            batches = (part[order].chunk(of.minibatches) for part in (states, targets))
-            losses += [self._descend(*batch) for batch in zip(*batches, strict=True)]
-        actor, critic, kl = np.mean(losses, axis=0).tolist()
+        orders = [torch.from_numpy(rng.permutation(len(states))) for _ in range(of.epochs)]
+        of_actor = states, torch.stack((actions, before, gained), dim=1)
+        if self._beside is None:
+            actor, kl = self._improve_actor(orders, *of_actor)
+            critic = self._improve_critic(orders, states, returns)
+        else:
+            improving = self._beside.submit(self._improve_actor, orders, *of_actor)
+            critic = self._improve_critic(orders, states, returns)
+            actor, kl = improving.result()
         explained = 1.0 - float((returns - values).var() / (returns.var() + 1e-8))
         return {
             "loss": critic,
@@ -255,27 +266,49 @@ class Ppo:
         """The mean actions (B,) for states with privileged states."""
         return self.policy.mean(states[:, : len(self.divisor)])
 
-    def _descend(self, states: Tensor, targets: Tensor) -> tuple[float, float, float]:
-        """One step on a minibatch; returns the losses and the mean divergence from the policy
-        before the update.
+    def _improve_actor(
+        self, orders: list[Tensor], states: Tensor, targets: Tensor
+    ) -> tuple[float, float]:
+        """All epochs of the actor; returns the means of its loss and of its divergence from the
+        policy before the update.
 
-        `targets` (B, 4): the action, the logarithm of its density before the update, its advantage,
-        and the return.
+        `targets` (B, 3): the action, the logarithm of its density before the update, its advantage.
         """
-        of, policy = self.settings, self.policy
-        actions, before, gained, returns = targets.unbind(1)
-        log_ratio = log_density(actions, self._means(states), policy.log_std) - before
-        actor = clipped_loss(log_ratio, scaled(gained), of.clip)
-        critic = 0.5 * ((policy.value(states) - returns) ** 2).mean()
-        self._adam.zero_grad(set_to_none=True)
-        (actor + critic).backward()  # type: ignore[no-untyped-call]
-        for part in (self._actor, self._critic):
-            nn.utils.clip_grad_norm_(part, of.max_gradient)
-        self._adam.step()
-        with torch.no_grad():
-            policy.log_std.clamp_(min=math.log(LEAST_STD))
-            kl = (log_ratio.exp() - 1.0 - log_ratio).mean()
-        return actor.item(), critic.item(), kl.item()
+        policy, found = self.policy, []
+        for batch, chosen in self._minibatches(orders, states, targets):
+            actions, before, gained = chosen.unbind(1)
+            log_ratio = log_density(actions, self._means(batch), policy.log_std) - before
+            loss = clipped_loss(log_ratio, scaled(gained), self.settings.clip)
+            self._descend(loss, 0)
+            with torch.no_grad():
+                policy.log_std.clamp_(min=math.log(LEAST_STD))
+                kl = (log_ratio.exp() - 1.0 - log_ratio).mean()
+            found.append((loss.item(), kl.item()))
+        mean_loss, mean_kl = np.mean(found, axis=0).tolist()
+        return mean_loss, mean_kl
+
+    def _improve_critic(self, orders: list[Tensor], states: Tensor, returns: Tensor) -> float:
+        """All epochs of the critic; returns the mean of its loss."""
+        losses = []
+        for batch, wanted in self._minibatches(orders, states, returns):
+            loss = 0.5 * ((self.policy.value(batch) - wanted) ** 2).mean()
+            self._descend(loss, 1)
+            losses.append(loss.item())
+        return float(np.mean(losses))
+
+    def _minibatches(
+        self, orders: list[Tensor], states: Tensor, targets: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        for order in orders:
+            parts = (part[order].chunk(self.settings.minibatches) for part in (states, targets))
+            yield from zip(*parts, strict=True)
+
+    def _descend(self, loss: Tensor, part: int) -> None:
+        """One step of the actor (part 0) or the critic (part 1)."""
+        self._adams[part].zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_((self._actor, self._critic)[part], self.settings.max_gradient)
+        self._adams[part].step()
 
     def weights(self) -> dict[str, Array]:
         """The arrays of the actor as in an actor's file."""
@@ -287,16 +320,20 @@ class Ppo:
     def store(self) -> tuple[Tensors, dict[str, int]]:
         """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
         tensors: Tensors = {}
-        for name, parameter in self.policy.named_parameters():
+        for name, parameter, moments in self._parameters():
             tensors[f"policy.{name}"] = parameter.detach().numpy()
-            for part, value in self._adam.state[parameter].items():
+            for part, value in moments.items():
                 tensors[f"adam.{name}.{part}"] = value.numpy()
         return tensors, {}
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
         """Continue from the arrays of a checkpoint."""
-        for name, parameter in self.policy.named_parameters():
+        for name, parameter, moments in self._parameters():
             parameter.data.copy_(torch.from_numpy(tensors[f"policy.{name}"]))
-            moments: dict[str, Any] = self._adam.state[parameter]
             for part in ("step", "exp_avg", "exp_avg_sq"):
                 moments[part] = torch.from_numpy(tensors[f"adam.{name}.{part}"].copy())
+
+    def _parameters(self) -> Iterator[tuple[str, nn.Parameter, dict[str, Any]]]:
+        """The name, the values and Adam's moments of each parameter."""
+        for name, parameter in self.policy.named_parameters():
+            yield name, parameter, self._adams[name.startswith("critic.")].state[parameter]

@@ -91,8 +91,8 @@ def _learner(
 
     from controllers.rl.ppo import Ppo
 
-    torch.set_num_threads(config.threads)
-    return Ppo(settings, definition, config.envs, config.seed)
+    torch.set_num_threads(1)  # its own threads would wait busily on the cores that move the cars
+    return Ppo(settings, definition, config.envs, config.seed, config.threads)
 
 
 class _Training:

@@ -82,9 +82,12 @@ def test_the_same_seed_gives_the_same_actor_and_another_one_another(tmp_path: Pa
     assert actor_of(tmp_path / "one")[0] != actor_of(tmp_path / "other")[0]
 
 
-def test_the_threads_of_the_cars_change_nothing_and_may_change(tmp_path: Path) -> None:
-    train(short(tmp_path, steps=UPDATE))
-    assert train(short(tmp_path, steps=UPDATE, threads=2))["steps"] == UPDATE
+def test_the_threads_change_nothing_and_may_change(tmp_path: Path) -> None:
+    for name, threads in (("one", 1), ("two", 2)):
+        train(short(tmp_path / name, steps=2 * UPDATE, threads=threads))
+    assert actor_of(tmp_path / "one") == actor_of(tmp_path / "two")
+    again = train(short(tmp_path / "one", steps=2 * UPDATE, threads=2))
+    assert again["steps"] == 2 * UPDATE
 
 
 def test_the_curves_of_a_training(tmp_path: Path) -> None:
