@@ -35,7 +35,7 @@ DELAYS = 3
 PERCEIVED = (0, 1, 4, 5, 6)
 """The numbers of the paper's state that the perception measures; the car's speeds are not late."""
 EPISODE_STEPS = (200, 800)
-STANDING = 0.25
+STANDING = 0.4
 """Share of the cars that start at rest; all other cars start in motion."""
 START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}
 START_SPEED = (0.0, 18.0)

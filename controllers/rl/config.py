@@ -88,7 +88,8 @@ ALGORITHMS = {
 class PpoSettings:
     """The settings of `ppo`; names without a comment are the names of Schulman et al. 2017."""
 
-    discount: float = 0.97
+    discount_length_m: float = 15.0
+    """The discount factor of a step is exp(-distance / this): 0.94 at 65 km/h."""
     gae_lambda: float = 0.95
     horizon: int = 64
     """Steps of each car between two updates."""
@@ -106,6 +107,8 @@ class PpoSettings:
     state_noise: float = 0.0
     """Standard deviation of the noise on the paper's state."""
     reward_baseline: float = 1.0
+    end_steps: int = 32
+    """The baseline is subtracted as often for the steps after a terminal state."""
     reward_scale: float = 1.0
     hidden: tuple[int, int] = (64, 64)
 

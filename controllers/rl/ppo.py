@@ -7,9 +7,12 @@ standard deviation that does not depend on the state. Advantages are generalised
 - The hidden layers have ReLU, and the mean action is odd: half the difference between tanh of the
   network's outputs for the state and for its mirror image. So the actor's files are those of `td3`.
 - An episode that is cut by its number of steps continues with the value of its last state.
-- Advantages are divided by their mean distance from their mean, not by their standard deviation,
-  and limited to 4 times it: an end costs hundreds of times as much as a usual step, and would hide
-  all others.
+- The discount factor of a step falls with the distance driven, not with time: a slow car needs
+  more steps, but not more metres, until it gains by its return to the middle.
+- Advantages are divided by their typical size in the state, which the critic's second output
+  learns: at the start, where the car is slow, they are small but cost most of the score. Then they
+  are divided by their mean distance from their mean, not by their standard deviation, and limited
+  to 4 times it: an end costs hundreds of times as much as a usual step, and would hide all others.
 - The critic also receives the exact state and the road ahead (`privileged`).
 - The standard deviation is at least LEAST_STD.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
@@ -32,40 +35,21 @@ from torch import Tensor, nn
 from controllers.laws.actor import NAMES, mirror_of
 from controllers.laws.actor_state import StateDefinition
 from controllers.rl import privileged
+from controllers.rl.advantages import advantages_of, discounts_at
 from controllers.rl.cars import Array, Step
 from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import PpoSettings
 
 ADAM_EPSILON = 1e-5
+SIZE_FLOOR, SIZE_WEIGHT = 0.01, 0.1
+"""Added to the size of an advantage before its logarithm is learned; weight of this loss."""
 ADVANTAGE_LIMIT = 4.0
+V_X_AT = privileged.PARTS.index("v_x") - privileged.SIZE
+"""Place of the speed in a state with its privileged state."""
 LEAST_STD = 0.05
 """Least standard deviation of the steering actions; a learned one falls to 0.02 within 1.5 million
 steps, and the score stands still from then on."""
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
-
-
-def advantages_of(
-    rewards: Array,
-    values: Array,
-    next_values: Array,
-    ended: NDArray[np.bool_],
-    over: NDArray[np.bool_],
-    discount: float,
-    gae_lambda: float,
-) -> Array:
-    """Generalised advantage estimates (T, N).
-
-    All arguments are (T, N). `next_values`: values of the states that the steps led to, before any
-    reset; after a terminal state (`ended`) no reward follows. An episode that is `over` passes
-    nothing on to the next one.
-    """
-    found = np.zeros_like(rewards)
-    errors = rewards + discount * next_values * ~ended - values
-    following = np.zeros_like(rewards[0])
-    for t in reversed(range(len(rewards))):
-        following = errors[t] + discount * gae_lambda * ~over[t] * following
-        found[t] = following
-    return found
 
 
 def scaled(advantages: Tensor) -> Tensor:
@@ -99,7 +83,7 @@ class Policy(nn.Module):
         self._order, self._signs = torch.from_numpy(order), torch.from_numpy(signs)
         size, hidden = definition.size, settings.hidden
         self.actor = _layers(size, hidden, 0.01, generator)
-        self.critic = _layers(size + privileged.SIZE, hidden, 1.0, generator)
+        self.critic = _layers(size + privileged.SIZE, hidden, 1.0, generator, outputs=2)
         self.log_std = nn.Parameter(torch.tensor(math.log(settings.first_std)))
 
     def mean(self, states: Tensor) -> Tensor:
@@ -114,15 +98,23 @@ class Policy(nn.Module):
 
     def value(self, states: Tensor) -> Tensor:
         """The values (B,) of scaled states with privileged states."""
-        values: Tensor = self.critic(states).squeeze(1)
-        return values
+        return self.value_and_size(states)[0]
+
+    def value_and_size(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """The values (B,) and the logarithms (B,) of the typical size of an advantage."""
+        values, sizes = self.critic(states).unbind(1)
+        return values, sizes
 
 
 def _layers(
-    size: int, hidden: tuple[int, int], gain: float, generator: torch.Generator
+    size: int,
+    hidden: tuple[int, int],
+    gain: float,
+    generator: torch.Generator,
+    outputs: int = 1,
 ) -> nn.Sequential:
-    """Two hidden layers with ReLU and one output, with orthogonal initial weights."""
-    widths = (size, *hidden, 1)
+    """Two hidden layers with ReLU, and the outputs, with orthogonal initial weights."""
+    widths = (size, *hidden, outputs)
     linears = [nn.Linear(*pair) for pair in pairwise(widths)]
     for linear, factor in zip(linears, (math.sqrt(2.0), math.sqrt(2.0), gain), strict=True):
         nn.init.orthogonal_(linear.weight, factor, generator=generator)
@@ -201,8 +193,8 @@ class Ppo:
         row.states[k] = np.hstack((states / self.divisor, step.privileged))
         row.last[k] = np.hstack((step.last / self.divisor, step.last_privileged))
         row.actions[k] = actions
-        end = of.reward_baseline * of.discount / (1.0 - of.discount)
-        row.rewards[k] = of.reward_scale * (step.rewards - of.reward_baseline - end * step.ended)
+        missing = of.reward_baseline * (1 + of.end_steps * step.ended)
+        row.rewards[k] = of.reward_scale * (step.rewards - missing)
         row.ended[k], row.over[k] = step.ended, step.over
         self._filled = (k + 1) % self.horizon
         if self._filled:
@@ -218,28 +210,31 @@ class Ppo:
         states = torch.from_numpy(row.states.reshape(-1, row.states.shape[2]))
         actions = torch.from_numpy(row.actions.reshape(-1))
         with torch.no_grad():
-            values = self.policy.value(states)
+            values, sizes = self.policy.value_and_size(states)
             before = log_density(actions, self._means(states), self.policy.log_std)
             next_values = self._next_values(values.numpy().reshape(shape))
+        speeds = row.states[:, :, V_X_AT] * privileged.SPREAD[V_X_AT]
         advantages = advantages_of(
             row.rewards,
             values.numpy().reshape(shape),
             next_values,
             row.ended,
             row.over,
-            of.discount,
+            discounts_at(speeds, of.discount_length_m),
             of.gae_lambda,
         )
         gained = torch.from_numpy(advantages.reshape(-1))
         returns = gained + values
+        wanted = torch.stack((returns, (gained.abs() + SIZE_FLOOR).log()), dim=1)
+        gained = gained / sizes.exp()
         orders = [torch.from_numpy(rng.permutation(len(states))) for _ in range(of.epochs)]
         of_actor = states, torch.stack((actions, before, gained), dim=1)
         if self._beside is None:
             actor, kl = self._improve_actor(orders, *of_actor)
-            critic = self._improve_critic(orders, states, returns)
+            critic = self._improve_critic(orders, states, wanted)
         else:
             improving = self._beside.submit(self._improve_actor, orders, *of_actor)
-            critic = self._improve_critic(orders, states, returns)
+            critic = self._improve_critic(orders, states, wanted)
             actor, kl = improving.result()
         explained = 1.0 - float((returns - values).var() / (returns.var() + 1e-8))
         return {
@@ -287,13 +282,16 @@ class Ppo:
         mean_loss, mean_kl = np.mean(found, axis=0).tolist()
         return mean_loss, mean_kl
 
-    def _improve_critic(self, orders: list[Tensor], states: Tensor, returns: Tensor) -> float:
-        """All epochs of the critic; returns the mean of its loss."""
+    def _improve_critic(self, orders: list[Tensor], states: Tensor, wanted: Tensor) -> float:
+        """All epochs of the critic; returns the mean of the loss of its values.
+
+        `wanted` (B, 2): the return, and the logarithm of the size of the advantage.
+        """
         losses = []
-        for batch, wanted in self._minibatches(orders, states, returns):
-            loss = 0.5 * ((self.policy.value(batch) - wanted) ** 2).mean()
-            self._descend(loss, 1)
-            losses.append(loss.item())
+        for batch, targets in self._minibatches(orders, states, wanted):
+            value, size = 0.5 * ((self.policy.critic(batch) - targets) ** 2).mean(dim=0)
+            self._descend(value + SIZE_WEIGHT * size, 1)
+            losses.append(value.item())
         return float(np.mean(losses))
 
     def _minibatches(

@@ -10,53 +10,68 @@ import pytest
 from controllers.laws.actor import Actor, ActorCard
 from controllers.laws.actor_state import HISTORY, PAPER, STATES
 from controllers.rl import privileged
+from controllers.rl.advantages import advantages_of, discounts_at
 from controllers.rl.cars import Step
 from controllers.rl.config import PpoSettings
 
 torch = pytest.importorskip("torch")
 
-from controllers.rl.ppo import Ppo, advantages_of, clipped_loss, log_density, scaled  # noqa: E402
+from controllers.rl.ppo import Ppo, clipped_loss, log_density, scaled  # noqa: E402
 
 RNG = np.random.default_rng(3)
 NOTHING = np.zeros((4, 1), np.bool_)
+SIZE = 7 + privileged.SIZE
 
 
 def column(*values: float) -> np.ndarray:
     return np.array(values, np.float32)[:, None]
 
 
+def every(discount: float) -> np.ndarray:
+    return column(*[discount] * 4)
+
+
 def test_advantages_of_a_constant_reward() -> None:
     """Values 0: the errors are the rewards, so that the sum is geometric."""
     zeros = column(0, 0, 0, 0)
-    found = advantages_of(column(1, 1, 1, 1), zeros, zeros, NOTHING, NOTHING, 0.8, 0.5)
+    found = advantages_of(column(1, 1, 1, 1), zeros, zeros, NOTHING, NOTHING, every(0.8), 0.5)
     assert found[:, 0] == pytest.approx([1 + 0.4 + 0.16 + 0.064, 1 + 0.4 + 0.16, 1.4, 1.0])
 
 
 def test_with_lambda_1_advantages_are_discounted_returns_minus_values() -> None:
     values = column(3, 1, -2, 5)
     next_values = np.vstack((values[1:], column(7)))
-    found = advantages_of(column(1, 2, 3, 4), values, next_values, NOTHING, NOTHING, 0.9, 1.0)
+    found = advantages_of(
+        column(1, 2, 3, 4), values, next_values, NOTHING, NOTHING, every(0.9), 1.0
+    )
     returns = 1 + 0.9 * 2 + 0.81 * 3 + 0.729 * 4 + 0.6561 * 7
     assert float(found[0, 0]) == pytest.approx(returns - 3, rel=1e-6)
     assert float(found[3, 0]) == pytest.approx(4 + 0.9 * 7 - 5)
 
 
 def test_advantages_equal_the_sum_of_their_definition() -> None:
-    steps, cars, discount, decay = 12, 5, 0.95, 0.9
+    steps, cars, decay = 12, 5, 0.9
+    discounts = RNG.uniform(0.9, 1.0, (steps, cars)).astype(np.float32)
     rewards, values, next_values = RNG.normal(size=(3, steps, cars)).astype(np.float32)
     ended = RNG.random((steps, cars)) < 0.15
     over = ended | (RNG.random((steps, cars)) < 0.2)
-    found = advantages_of(rewards, values, next_values, ended, over, discount, decay)
+    found = advantages_of(rewards, values, next_values, ended, over, discounts, decay)
     for car in range(cars):
         for start in range(steps):
             total, factor = 0.0, 1.0
             for t in range(start, steps):
-                following = 0.0 if ended[t, car] else discount * next_values[t, car]
+                following = 0.0 if ended[t, car] else discounts[t, car] * next_values[t, car]
                 total += factor * (rewards[t, car] + following - values[t, car])
-                factor *= discount * decay
+                factor *= discounts[t, car] * decay
                 if over[t, car]:
                     break
             assert float(found[start, car]) == pytest.approx(total, abs=1e-5)
+
+
+def test_discounts_fall_with_the_distance_driven() -> None:
+    """20 m/s are 1 m in a step; below 1 m/s the distance is that of 1 m/s."""
+    found = discounts_at(np.array([[20.0, 1.0, -3.0]], np.float32), 25.0)
+    assert found[0].tolist() == pytest.approx([math.exp(-0.04), *[math.exp(-0.002)] * 2])
 
 
 def test_the_loss_is_clipped_on_the_side_that_would_gain() -> None:
@@ -153,12 +168,31 @@ def test_the_critic_knows_what_the_actor_does_not_see() -> None:
     assert figures["explained_variance"] > 0.95
 
 
-def test_a_terminal_state_costs_the_baseline_for_ever() -> None:
-    ppo = Ppo(PpoSettings(discount=0.9, reward_baseline=1.0, reward_scale=2.0), PAPER, 2, 0)
+def test_the_critic_learns_the_size_of_an_advantage() -> None:
+    """Rewards spread by 2 where a number of the privileged state is above 0, by 0.2 elsewhere."""
+    cars, rng = 64, np.random.default_rng(0)
+    settings = replace(PpoSettings(), horizon=16, minibatches=4, reward_baseline=0.0)
+    ppo = Ppo(settings, PAPER, cars, 0)
+    states, ended = np.zeros((cars, 7), np.float32), np.ones(cars, np.bool_)
+    for _ in range(16 * 20):
+        exact = np.zeros((cars, privileged.SIZE), np.float32)
+        exact[:, 9] = rng.choice([-1.0, 1.0], cars)
+        rewards = rng.choice([-1.0, 1.0], cars) * np.where(exact[:, 9] > 0.0, 2.0, 0.2)
+        ppo.learn(
+            states, ppo.explore(states, rng), step_of(states, rewards, ended, exact), rng, 1.0
+        )
+    asked = torch.zeros(2, SIZE)
+    asked[:, 7 + 9] = torch.tensor([-1.0, 1.0])
+    sizes = ppo.policy.value_and_size(asked)[1].exp()
+    assert sizes.tolist() == pytest.approx([0.21, 2.01], rel=0.25)
+
+
+def test_a_terminal_state_costs_the_baseline_of_many_steps() -> None:
+    ppo = Ppo(PpoSettings(end_steps=9, reward_baseline=1.0, reward_scale=2.0), PAPER, 2, 0)
     states = np.zeros((2, 7), np.float32)
     step = step_of(states, np.array([-2.0, 0.75]), np.array([True, False]))
     ppo.learn(states, np.zeros(2, np.float32), step, RNG, 1.0)
-    assert ppo._rollout.rewards[0] == pytest.approx([2.0 * (-2.0 - 10.0), -0.5])
+    assert ppo._rollout.rewards[0] == pytest.approx([2.0 * (-2.0 - 1.0 - 9.0), -0.5])
 
 
 def test_a_cut_episode_continues_with_the_value_of_its_last_state() -> None:
