@@ -131,11 +131,9 @@ def test_everything_equals_gymnasiums_vector_of_single_environments(
         ended += int(found[2].sum() + found[3].sum())
         if step == 60:
             mask = np.arange(count) % 2 == 0
-            where = {"s": 50.0, "to_middle": 0.5}
-            assert_equal(
-                vector.reset(seed=9, options={"reset_mask": mask, **where}),
-                expected.reset(seed=9, options={"reset_mask": mask, **where}),
-            )
+            some = {"reset_mask": mask, "s": 50.0, "to_middle": 0.5}
+            one, other = (each.reset(seed=9, options=dict(some)) for each in (vector, expected))
+            assert_equal(one, other)
     assert ended > 5
     vector.close()
     expected.close()
@@ -170,14 +168,9 @@ def test_ranges_and_random_roads_are_drawn_anew_in_each_episode() -> None:
         _, info = env.reset(seed=seed, options={"s": (0.0, 500.0)})
         world = env.unwrapped.world  # type: ignore[attr-defined]
         assert world.car.inertia[2] / world.car.mass == pytest.approx(1113.0 / 1150.0)
-        road = world.road
-        drawn.append(
-            (
-                *(road.track.name, road.lanes, road.lane_width),
-                *(world.car.friction, world.car.mass),
-                *(info["to_middle"], info["s"]),
-            )
-        )
+        road, car = world.road, world.car
+        row = road.track.name, road.lanes, road.lane_width, car.friction, car.mass
+        drawn.append((*row, info["to_middle"], info["s"]))
         assert info["speed_kmh"] == pytest.approx(36.0)
     env.close()
     names, lanes, widths, frictions, masses, offsets, places = zip(*drawn, strict=True)
