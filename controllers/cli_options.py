@@ -36,30 +36,33 @@ Steps = Annotated[
     "Control steps of 50 ms. Default: the paper's number on its tracks, about a lap on other "
     "tracks.",
 ]
-MODELS = 'run folder, name in runs/, "latest", or a shipped model: "default" or "varied".'
-Model = Annotated[str, f"Model of --perception model: {MODELS}"]
+MODELS = 'a run folder, its name in runs/, "latest", or a shipped model: "default" or "varied".'
+Model = Annotated[str, f"Model to use with --perception model: {MODELS}"]
 Latency = Annotated[float, "Latency of the perception's answers, ms, 0 to 1000."]
 Drop = Annotated[float, "Share of the perception's answers that are lost, 0 to below 1."]
 Light = Annotated[
     str,
-    "Light of the images: clear, overcast, dusk, fog, heavy-shadow, rain or snow. The truth does "
-    "not depend on it.",
+    "Light of the images: clear, overcast, dusk, fog, heavy-shadow, rain or snow. It has no effect "
+    "on --perception truth.",
 ]
 Parameters = Annotated[
     Path | None,
     "File written by `controllers tune`. Default: each controller's own parameters.",
 ]
 Reward = Annotated[
-    str, "paper, or quadratic: -(0.3 d^2 + angle^2 + 0.03 delta^2), the paper's second reward."
+    str,
+    "Reward: paper, or quadratic, the paper's second reward: -(0.3 d^2 + angle^2 + 0.03 delta^2), "
+    "with the offset d in m, the angle and the front wheel angle delta in rad.",
 ]
 
 
 def options(
     config: type[Config],
 ) -> Callable[[Callable[[Config, bool], None]], Callable[..., None]]:
-    """Makes a Typer command of a function of a configuration and `as_json`.
+    """Returns a decorator that turns a function `f(configuration, as_json)` into a Typer command.
 
-    Its options are the annotated fields of the dataclass `config`, with their defaults, and --json.
+    The options of the command are the annotated fields of the dataclass `config`, with their
+    defaults, and --json.
     """
     declared = [
         Parameter(

@@ -87,7 +87,7 @@ class Controller(Protocol):
 
 
 class BatchController(Controller, Protocol):
-    """A controller that can also steer many cars in one call; comparisons then drive them at once.
+    """A controller that can also steer many cars in one call, which comparisons use.
 
     A controller object steers either one car by `update`, or the same N cars by `update_batch`.
     """
@@ -98,8 +98,8 @@ class BatchController(Controller, Protocol):
     def update_batch(self, observations: Observations) -> NDArray[np.float64]:
         """The steering actions (N,) of all cars; called once for each control step.
 
-        Car k must get the action that an `update` of a controller of its own returns. A car whose
-        drive is over keeps its last observation; its action is ignored.
+        The action of car k must equal the action that `update` of a separate controller for car k
+        returns. A car whose drive is over keeps its last observation; its action is ignored.
         """
 
 
@@ -110,6 +110,6 @@ class LoopConfig:
     dt: float
     """Duration of a control step, s."""
     noisy: bool = False
-    """Whether a perception estimates the state, with errors; otherwise the state is exact."""
+    """True if a perception estimates the state, with errors; False if the state is exact."""
     delay_s: float | None = None
     """Delay of the perceived offset and angle, s; None if it is unknown."""

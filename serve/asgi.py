@@ -40,7 +40,7 @@ async def read_body(receive: Receive, take: Callable[[int], None]) -> bytes:
 
 
 async def send_reply(send: Send, reply: Reply, protocol: str = "http") -> None:
-    """Send a reply; with `protocol` "websocket.http" it refuses a handshake."""
+    """Send a reply; with `protocol` "websocket.http" the reply refuses a WebSocket handshake."""
     headers = [*reply.headers, (b"content-length", b"%d" % len(reply.body))]
     await send({"type": f"{protocol}.response.start", "status": reply.status, "headers": headers})
     await send({"type": f"{protocol}.response.body", "body": reply.body})

@@ -26,7 +26,7 @@ Model = Annotated[
 ]
 NewModel = Annotated[
     str | None,
-    typer.Option(help="Model to load, as for `serve --model`. Default: the current one again."),
+    typer.Option(help="Model to load, as for `serve --model`. Default: the current model again."),
 ]
 Host = Annotated[str, typer.Option(help="Address to listen on. Default: this machine only.")]
 Port = Annotated[int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)]
@@ -40,7 +40,7 @@ TokenFile = Annotated[
     Path | None,
     typer.Option(
         help="File with the token that clients must send in the header Authorization: Bearer. "
-        "Default: $DRIVERVIEW_TOKEN; if that is empty, no token."
+        "Default: the token in $DRIVERVIEW_TOKEN; if it is empty, no token is required."
     ),
 ]
 Insecure = Annotated[
@@ -51,7 +51,11 @@ Insecure = Annotated[
 ]
 RequestRate = Annotated[
     float,
-    typer.Option(help="Requests per second allowed for each other machine; 0: no limit.", min=0),
+    typer.Option(
+        help="Requests per second allowed from one client address, except from this machine; 0: no "
+        "limit.",
+        min=0,
+    ),
 ]
 Connections = Annotated[
     int, typer.Option(help="Largest number of open connections.", min=1, max=65536)

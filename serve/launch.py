@@ -1,4 +1,4 @@
-"""Starts the service: checks, listening sockets, the first line on stderr; shuts it down cleanly.
+"""Starts the service (checks, listening sockets, first line on stderr) and shuts it down cleanly.
 
 Each worker process has one engine with one thread, because two threads in one process slow each
 other down. All workers share the listening sockets; `serve.workers.supervisor` manages them.

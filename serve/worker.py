@@ -125,8 +125,8 @@ def handle_commands(
 
 
 def reload(supervisor: SupervisorConnection, app: Service, folder: str, generation: int) -> None:
-    """Load and check new weights while the old ones are in use. The new ones replace them once the
-    supervisor commits `generation`."""
+    """Load and check new weights while the old weights are in use. The new weights replace the old
+    ones once the supervisor commits `generation`."""
     head = app.shared.head()
     try:
         engine = load(Path(folder), None)

@@ -21,8 +21,8 @@ class CompareConfig:
     ] = "truth"
     seeds: Annotated[
         int,
-        "Number of drives of each kind, with seeds 0, 1, ... On the truth without --disturb they "
-        "are all equal.",
+        "Number of drives of each kind, with seeds 0, 1, ... The drives of a kind are equal on the "
+        "truth without --disturb.",
     ] = 1
     disturb: Annotated[
         bool,
@@ -48,7 +48,7 @@ class CompareConfig:
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """A search for the parameters of several controllers with equal numbers of drives."""
+    """A search for the parameters of several controllers, with equal numbers of drives for each."""
 
     out: Annotated[Path, "File for the parameters found."] = Path("tuned.json")
     controllers: Annotated[
@@ -58,7 +58,9 @@ class TuneConfig:
     ] = "lqr,mpc"
     tracks: options.Tracks = "forza"
     budget: Annotated[
-        int, "Drives of each controller on each track; the first is with its own parameters."
+        int,
+        "Number of drives of each controller on each track. The first drive has the controller's "
+        "own parameters.",
     ] = 40
     reward: options.Reward = "paper"
     steps: options.Steps = None

@@ -21,15 +21,15 @@ class CurveRecorder:
         self._rows.append((now.time_s, now.to_middle, now.angle, seen, perceived.angle))
 
     def curves(self) -> dict[str, list[float | None]]:
-        """`curves_of` the steps so far."""
+        """The curves of the steps so far, by `curves_of`."""
         return curves_of(np.array(self._rows))
 
 
 def curves_of(table: FloatArray) -> dict[str, list[float | None]]:
-    """The columns `COLUMNS` of the control steps (n, 5), of at most `MAX_POINTS` points; None if
-    nothing was perceived.
+    """The columns `COLUMNS` of the control steps `table` (n, 5), at up to `MAX_POINTS` points.
 
-    Each point is the step with the largest offset of its stretch, so that no peak is lost.
+    A value is None where nothing was perceived. The steps are divided into parts of equal length,
+    and each point is the step with the largest offset in its part, so that no peak is lost.
     """
     chosen = [
         part[np.argmax(np.abs(table[part, 1]))]

@@ -60,7 +60,7 @@ def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
 
 
 def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
-    """Rows of `FIGURES` over the seeds, one for each track and controller."""
+    """Rows with the columns `FIGURES`, one for each track and controller, over all seeds."""
     pairs = dict.fromkeys((entry["track"], entry["controller"]) for entry in drives)
     for track, controller in pairs:
         results = _results(drives, track, controller)

@@ -1,9 +1,9 @@
 """The drives of a comparison, and the file with their results.
 
-A controller with `update_batch` makes its drives on the truth at once; all other drives are made
-one by one. `results.json` is {"version", "settings", "drives": [...]} and is written after each
-batch. A drive whose result is in the file is not driven again, unless its controller or model has
-changed.
+On the truth, all drives of a controller with `update_batch` are made at once; all other drives are
+made one by one. `results.json` is {"version", "settings", "drives": [...]} and is written after
+each batch. A drive whose result is in the file is not driven again, unless its controller or model
+has changed.
 """
 
 import hashlib
@@ -38,12 +38,13 @@ SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
 """Settings that are equal for all drives of a file."""
 
 Progress = Callable[[float, int, str], None]
-"""A function that is called with the number of drives done, in fractions, their total number, and
-the name of the present drive or controller. Several threads call it."""
+"""A function that is called with the number of drives done (parts of a drive count as fractions),
+the total number of drives, and the name of the present drive or controller. Several threads call
+it."""
 Report = Callable[[float, str], None]
 """`Progress` without the total number."""
 Driven = dict[str, Any] | UserError
-"""The result of a drive with its curves, or why it has none."""
+"""The result of a drive with its curves, or the error of a drive without a result."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def names(text: str, what: str) -> list[str]:
 
 def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str, Any]:
     """Make all drives of the comparison (cells) that have no result in `config.out`; returns the
-    results of all.
+    results of all drives.
 
     Raises UserError before the first drive for an unknown name, a folder with results of other
     settings, or a folder to which another process writes. Raises ContactsUnavailable after the last
@@ -148,7 +149,8 @@ def drive_cells(
 ) -> Iterator[list[tuple[Cell, Driven]]]:
     """Drive the cells; yields batches of their results.
 
-    `report` is called with the number of drives done, in fractions, and what is driven.
+    `report` is called with the number of drives done (parts of a drive count as fractions) and the
+    name of the present drive or controller.
     """
     tasks = tasks_of(config, missing)
     groups = groups_at_once(config, tasks)
@@ -202,7 +204,7 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
 
 
 def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
-    """For each controller with `update_batch` the cells that it can drive at once."""
+    """For each controller with `update_batch`, the cells that `drive_many` can drive at once."""
     groups: dict[str, list[Cell]] = {}
     for cell, (drive_config, _) in tasks.items():
         if can_join(drive_config):
@@ -219,7 +221,7 @@ def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, 
 
 
 def entry_of(cell: Cell, outcome: Outcome) -> Driven:
-    """The result of one of many drives, for seed 0 with its curves."""
+    """The result of a drive of `drive_many`; it includes the curves if the seed is 0."""
     if isinstance(outcome.result, UserError):
         return outcome.result
     curves = {"curves": curves_of(outcome.curves)} if cell.seed == 0 else {}
@@ -227,7 +229,7 @@ def entry_of(cell: Cell, outcome: Outcome) -> Driven:
 
 
 def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> Driven:
-    """The result of one drive alone, for seed 0 with its curves."""
+    """Make one drive and return its result; it includes the curves if the seed is 0."""
     recorder = CurveRecorder()
     config, disturbance = task
     try:
@@ -250,7 +252,7 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
 
 
 def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
-    """For each drive a hash of the inputs that its cell does not name: the tuned parameters, the
+    """For each drive, a hash of the inputs that its cell does not name: the tuned parameters, the
     road, the user's file or trained actor, and the weights of the model or the service's model."""
     tracks = {
         name: find_track(name, config.tracks_dir).content_hash.encode()
@@ -273,7 +275,7 @@ def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
 
 
 def _model_of(config: CompareConfig, perception: str) -> str:
-    """The hash of a perception's model; empty on the truth."""
+    """The hash of the weights of a perception's model; empty for the truth."""
     if perception == "truth":
         return ""
     return model_hash(config.model) if perception == "model" else service_model_hash(perception)
@@ -296,7 +298,7 @@ def model_hash(run: str) -> str:
 
 
 def service_model_hash(url: str) -> str:
-    """SHA-256 of the weights of the model at `url`. Raises UserError if it does not answer."""
+    """SHA-256 of the weights of the service at `url`. Raises UserError without an answer."""
     service = ServiceModel(url)
     service.close()
     return service.model_hash

@@ -29,7 +29,7 @@ VERSION = 1
 EXPLORED = 1.0 / 3.0
 """Share of the budget that is drawn over the whole ranges."""
 SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed", "budget")
-"""Settings that the file stores; another search refuses it."""
+"""Settings that are stored in the file. A search with other settings refuses the file."""
 
 Progress = Callable[[int, int, str], None]
 """A function that is called with the candidates done, their total number, and the controller."""
@@ -82,7 +82,8 @@ def propose(
     budget: int,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """The candidate after those in `tried`; {} is the controller's own parameters."""
+    """The next candidate after the candidates in `tried`; {} stands for the controller's own
+    parameters."""
     if not tried:
         return {}
     best = max(tried, key=lambda one: float(one["reward"]))["parameters"]

@@ -32,7 +32,8 @@ LEARNED_RATIO = 0.65
 """A feature counts as learned if its error is at most this share of the baseline's error. The
 baseline always predicts the mean of the training labels."""
 MIN_TERMINAL_WIDTH = 120
-"""Columns that the tables need; a narrower terminal wraps whole lines, which stay readable."""
+"""Width of the tables in columns of the terminal. A narrower terminal wraps whole lines, which stay
+readable."""
 ANSWER_COLUMNS = (
     *("round", "track", "lanes"),
     *(f"{name} (m)" for name in MARKINGS),
@@ -72,7 +73,7 @@ def check_limits(result: DemoResult) -> list[LimitCheck]:
 
 
 def check_evaluation(evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """The checks of the results of an evaluation, feature by feature."""
+    """Compare each feature's error in an evaluation with its limit and the baseline's error."""
     baseline = evaluation["baseline"]
     rows = []
     for name in MARKINGS:
@@ -94,10 +95,10 @@ def _check_error(what: str, error: float, mean: float, limit: float | None) -> L
 
 
 def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """The checks of the service's answers: their mean errors may reach the 95th percentile of the
-    evaluation's errors.
+    """Compare the mean errors of the service's answers with their limits: the 95th percentiles of
+    the evaluation's errors.
 
-    A service with another camera or model than the evaluated one has far larger errors.
+    A service with another camera or another model exceeds the limits by far.
     """
     found = []
     for what, name, pairs in (
@@ -117,7 +118,7 @@ def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[
 
 
 def check_drive(drive: dict[str, Any]) -> LimitCheck:
-    """The check of the drive on the service's answers: the car stays on the road, near its lane."""
+    """Check the drive on the service's answers: the car must stay on the road, near its lane."""
     mean = drive["mean_abs_d_m"]
     stayed = drive["ended"] is None and mean <= MAX_MEAN_ABS_D_M
     return LimitCheck("drive: mean |d| (m)", mean, None, MAX_MEAN_ABS_D_M, stayed)

@@ -80,17 +80,17 @@ def _duration(minutes: float) -> str:
 def run_demo(config: DemoConfig) -> DemoResult:
     """Try the shipped model, then collect, verify, train, evaluate, serve, predict and drive.
 
-    All results are written to `config.out`. With `config.first_drive` the demo ends after the
-    shipped model. Raises UserError if `config.out` contains files of another origin, or if a step
-    fails.
+    All results are written to `config.out`. With `config.first_drive` the demo ends after the drive
+    of the shipped model. Raises UserError if `config.out` contains files that are not of a demo, or
+    if a step fails.
     """
     _check_folder(config.out)
     result = DemoResult()
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
-    # In a short training the best frames are far apart, each with another scenery
-    # (docs/experiments/data.md). Four sceneries a round: the default for this length is one.
+    # A short training needs frames that are far apart, each with another scenery
+    # (docs/experiments/data.md). The default for rounds of this length is one scenery per round.
     collect += ["--frequency", "4", "--stretch", "1", "--scenes", "4"]
     collect += ["--split-test-share", f"{TEST_SHARE:g}"]
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]

@@ -61,7 +61,7 @@ class Pedals(Protocol):
 
     @property
     def mean_error(self) -> float | None:
-        """Mean distance (m/s) from the set-point; None without a set-point."""
+        """Mean absolute speed error (m/s); None without a set-point."""
 
     def __call__(
         self, now: CarState, traffic: Traffic, perceived: Perceived
@@ -116,15 +116,15 @@ class DriveResult:
     slowed_steps: int
     """Steps in which the car slowed down because the perception was lost for more than 1 s."""
     noisy: bool
-    """Whether the controller received an estimated state, with errors, or the true state."""
+    """True if the controller received an estimated state with errors, False for the true state."""
     ended: str | None
     """Why the drive ended early: off_track (also by a contact with a wall), backwards, or collision
-    (with a car); None if it did not."""
+    (with a car); None for a complete drive."""
     real_time: RealTimeFigures | None = None
     """Figures of a drive on the wall clock; in JSON they are fields of the result itself."""
     speed_error_m_s: float | None = None
-    """Mean distance from the set-point of `--speed` on free straights; None (absent from JSON)
-    without a set-point."""
+    """Mean absolute difference from the set-point of `--speed` on free straights; None (absent from
+    JSON) without a set-point."""
 
     def per_step(self, reward: str) -> float:
         """The mean over `steps_asked` of the reward called `reward`, one of `REWARDS`."""
@@ -290,8 +290,10 @@ class Driven:
 def sum_rewards(
     after: FloatArray, lane_centre: float, half_width: float, ended: bool
 ) -> tuple[float, float]:
-    """The sums of `step_reward` and `quadratic_reward` over the steps `after` (n, 5) of `Driven`;
-    whether the last one `ended` the drive."""
+    """The sums of `step_reward` and `quadratic_reward` over the steps `after` (n, 5) of `Driven`.
+
+    `ended`: whether the last step ended the drive.
+    """
     score, quadratic = 0.0, 0.0
     for k in range(len(after)):
         end, angle = ended and k == len(after) - 1, after[k, 1]
@@ -309,7 +311,7 @@ x, y and z in m."""
 class DriveLog:
     """CSV log with the columns of the reference laps of the real TORCS, a row per control step.
 
-    A row has the state that the controller acted on and its steering action. It is complete when
+    A row has the state before the control step and the steering action. The row is complete when
     `write` returns.
     """
 

@@ -20,7 +20,9 @@ class DriveConfig:
     track: options.Track = "oval"
     lanes: Annotated[int, "Number of lanes, 1 to 3."] = 1
     perception: Annotated[
-        str, "truth, model, or the address of a service, e.g. http://127.0.0.1:8000."
+        str,
+        "Perception: truth (the exact state), model, or the address of a service, e.g. "
+        "http://127.0.0.1:8000.",
     ] = "truth"
     steps: options.Steps = None
     log: Annotated[Path | None, "CSV file for the state and the steering of each step."] = None
@@ -31,8 +33,7 @@ class DriveConfig:
             metavar="PORT",
             min=0,
             max=65535,
-            help="Show the drive live in the browser, at its real pace, at this port; 0: any free "
-            "port.",
+            help="Show the drive in the browser in real time, at this port; 0: any free port.",
         ),
     ] = None
     latency_ms: options.Latency = 0.0
@@ -42,7 +43,7 @@ class DriveConfig:
         Option(
             "--realtime",
             help="Drive on the wall clock, without waiting for the perception's answers. "
-            "No two such drives are the same.",
+            "The result differs from drive to drive.",
         ),
     ] = False
     parameters: options.Parameters = None
@@ -60,8 +61,8 @@ class DriveConfig:
     ] = None
     speed: Annotated[
         float | None,
-        "Speed to hold, m/s, 1 to 40; slower in bends and behind traffic. Default: hold the "
-        "throttle.",
+        "Speed to hold, m/s, 1 to 40; the car slows down in bends and behind traffic. Default: the "
+        "throttle is held instead.",
     ] = None
     traffic: Annotated[int, "Number of other cars, 0 to 12."] = 0
     light: options.Light = "clear"

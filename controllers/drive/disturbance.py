@@ -1,7 +1,7 @@
 """Disturbances of a drive: sensor noise, delay, wind, and another car. SI units.
 
-A disturbance depends only on the seed of the drive, so that all controllers meet the same one
-(paired seeds).
+A disturbance depends only on the seed of the drive, so that all controllers drive under the same
+disturbance (paired seeds).
 """
 
 import math
@@ -26,7 +26,7 @@ NOISE_STD = np.array(
 )
 """Standard deviations of the noise on offset, angle, vx, vy and yaw rate."""
 DELAY_S = 0.1
-"""Delay of the perception."""
+"""Delay (s) of the perception."""
 GUST_M_S, GUST_S = 6.0, 1.5
 """Standard deviation and correlation time of the side wind (a Gauss-Markov process)."""
 SIDE_FORCE_M2 = 4.5
@@ -45,7 +45,7 @@ class Disturbance:
 
     noise: bool = False
     delay_s: float = 0.0
-    """Delay of the perception, over which the state is not predicted."""
+    """Delay of the perception, s; the state is not predicted over this delay."""
     wind: bool = False
     friction: bool = False
     mass: bool = False
@@ -88,7 +88,7 @@ class Disturbance:
         return Gusts(dt, np.random.default_rng([seed, 4]))
 
     def noise_rng(self, seed: int) -> np.random.Generator:
-        """Draws the standard normal numbers (5,) of each step for NOISE_STD."""
+        """Generator of the standard normal numbers (5,) of each step, which NOISE_STD scales."""
         return np.random.default_rng([seed, 6])
 
 

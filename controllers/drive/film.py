@@ -27,8 +27,8 @@ CURVE_HEIGHT = 90  # px
 OFFSET_SPAN_M, ANGLE_SPAN_RAD = 1.0, 0.1
 """Values at the upper and lower edge of the curves; larger values are drawn at the edge."""
 NOTHING: tuple[Distances, float] = ({}, 0.0)
-"""The perceived markings of a drive on the truth: there are none, and the film shows the true
-ones."""
+"""The perceived markings and angle on the truth: there are no markings, and the film shows only the
+true markings."""
 TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 
 

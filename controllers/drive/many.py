@@ -1,7 +1,7 @@
 """Many drives of one controller at once: the cars of a fleet, moved and observed by compiled calls.
 
-A drive has the numbers of `controllers.drive.run.drive`, bit for bit, however many are driven at
-once. It is on the truth, with the throttle held; each core drives a part of the cars.
+The result of a drive equals the result of `controllers.drive.run.drive` bit for bit, for any number
+of drives. All drives are on the truth, with the throttle held; each core moves a part of the cars.
 """
 
 import os
@@ -42,8 +42,8 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 CARS = 64
-"""Largest number of cars in one batch: with so many cars the Python code of a step takes a small
-part of the time."""
+"""Largest number of cars in one batch: with 64 cars the Python code takes a small part of the time
+of a step."""
 FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
     *("target_lane", "seed", "model", "light"),
@@ -55,7 +55,8 @@ PHYSICS_STEPS = PHYSICS_HZ // FREQUENCY_HZ
 
 Task = tuple[DriveConfig, Disturbance]
 Report = Callable[[float], None]
-"""A function that is called with the number of drives done, in fractions; from several threads."""
+"""A function that is called with the number of drives done (parts of a drive count as fractions).
+Several threads call it."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ class Outcome:
     """One of many drives."""
 
     number: int
-    """Its index in the list of drives."""
+    """Index of the drive in the list of drives."""
     result: DriveResult | UserError
-    """The error of a drive without a result; it has no effect on the other drives."""
+    """The result, or the error of a drive without a result; an error does not stop other drives."""
     curves: FloatArray
     """(n, 5): time (s), true offset (m) and angle (rad), perceived offset (NaN: none) and angle, in
     each control step, as the controller acted on them."""
@@ -73,7 +74,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Ride:
-    """One drive, checked."""
+    """A drive whose configuration has been checked."""
 
     number: int
     road: Road
@@ -84,8 +85,10 @@ class _Ride:
 
 
 def can_join(config: DriveConfig) -> bool:
-    """Whether a drive can be one of many, if its controller has `update_batch`: on the truth,
-    without traffic, simulated latency, film, log or set speed."""
+    """Whether `drive_many` can make a drive if its controller has `update_batch`.
+
+    The drive must be on the truth, without traffic, simulated latency, film, log or set speed.
+    """
     return config == replace(DriveConfig(), **{name: getattr(config, name) for name in FREE})
 
 
@@ -96,8 +99,8 @@ def drive_many(
 ) -> Iterator[list[Outcome]]:
     """Drive the `tasks`, which all have the same controller; yields batches of their outcomes.
 
-    `parameters` of the controller replace those of the files in the configurations. Raises
-    UserError for an unknown name, a start outside the road, and an error of `update_batch`.
+    `parameters` replace the controller's parameters in the files that the configurations name.
+    Raises UserError for an unknown name, a start outside the road, and an error of `update_batch`.
     """
     rides = _check(tasks)
     config = tasks[0][0]
@@ -165,7 +168,7 @@ class _Batch:
         self._arrays = _arrays(rides, [car.total_mass for car in cars])
 
     def drive(self) -> Iterator[float]:
-        """Drive all cars to the end; yields the share that is done now and then."""
+        """Drive all cars to the end; yields from time to time the share of the work done."""
         for ride, world in zip(self._rides, self._worlds, strict=True):
             world.reset(seed=ride.seed, to_middle=ride.lane.start_d)
         rows, count = self._fleet.cars, len(self._rides)
@@ -191,7 +194,8 @@ class _Batch:
         return [self._outcome(number) for number in range(len(self._rides))]
 
     def _check_steers(self, steers: FloatArray, step: int) -> FloatArray:
-        """The steering actions; a drive whose action is not in [-1, 1] is over without a result."""
+        """The checked steering actions. A drive whose action is not in [-1, 1] ends without a
+        result."""
         rows = self._fleet.cars
         wrong = ~(np.abs(steers) <= 1.0) & (rows[:, SKIPPED] == 0.0)
         for number in np.flatnonzero(wrong).tolist():
@@ -205,8 +209,8 @@ class _Batch:
         return steers
 
     def _complete(self) -> int:
-        """Complete the control steps of the cars that touch something; returns how many of their
-        drives go on."""
+        """Complete the control steps of the cars that touch something; returns the number of these
+        cars whose drives go on."""
         rows, fleet = self._fleet.cars, self._fleet.arrays
         waiting, running = (rows[:, SKIPPED] == 0.0) & (rows[:, DONE] < PHYSICS_STEPS), 0
         for number in np.flatnonzero(waiting).tolist():

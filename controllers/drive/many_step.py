@@ -56,23 +56,23 @@ class RideArrays(NamedTuple):
     seen: FloatArray
     """(N, OBSERVED): the rows of `Observations` of the present step."""
     log: FloatArray
-    """(N, S + 1, LOG)"""
+    """(N, S + 1, LOG): a row for each control step; see LOG."""
     ended: NDArray[np.int64]
     """(N,): `ending_code` of the last step."""
     steps: NDArray[np.int64]
     """(N,): control steps requested."""
     delays: NDArray[np.int64]
-    """(N,): control steps by which the perception is late."""
+    """(N,): delay of the perception in control steps."""
     lane_centres: FloatArray
-    """(N,) m left of the track's centre."""
+    """(N,): centre of the lane to follow, m left of the track's centre."""
     noisy: NDArray[np.bool_]
     """(N,): whether `errors` are added to the observations."""
     errors: FloatArray
-    """(N, S, 5): of offset, angle, vx, vy and yaw rate."""
+    """(N, S, 5): errors of offset, angle, vx, vy and yaw rate."""
     gusts: FloatArray
     """(N, S): side wind, m/s."""
     masses: FloatArray
-    """(N,) kg"""
+    """(N,): mass of each car, kg."""
 
 
 @compiled_for_threads
@@ -101,7 +101,7 @@ def observe_rides(
     """Observe the cars among `begin` to `end` - 1 whose control step of `steps` physics steps is
     complete; a car whose drive is over is left out of later steps (SKIPPED).
 
-    Returns how many drives go on, and how many cars did not complete their step.
+    Returns the number of drives that go on, and the number of cars that did not complete the step.
     """
     running, incomplete = 0, 0
     for number in range(begin, end):
@@ -141,7 +141,7 @@ def note_state(number: int, fleet: Arrays, rides: RideArrays) -> bool:
 
 @compiled
 def observe_ride(number: int, step: int, car: FloatArray, rides: RideArrays) -> None:
-    """Fill the observation of a car: `controllers.perception.sources.truth`, late and with noise.
+    """Fill the observation of a car: `controllers.perception.sources.truth` with delay and noise.
 
     Before the first answer the offset and the angle are 0, and the road is straight.
     """

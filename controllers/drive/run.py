@@ -89,7 +89,8 @@ def drive(
     lane = choose_lane(config, road)
     steps = steps_for(config.steps, track.name, track.length_m)
     noisy = config.perception != "truth"
-    # What is perceived on images is predicted to the present; a disturbance's delay is unknown.
+    # Answers to images are already predicted to the present. The controller does not know the delay
+    # of a disturbance.
     delay_s = 0.0 if noisy and disturbance is None else None
     loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy, delay_s=delay_s)
     if parameters is None:
@@ -179,8 +180,7 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """A perception: `perceive` with the latency and losses of `config`, in which uncertain answers
-    have less weight.
+    """Adds the latency and the losses of `config` to `perceive`; uncertain answers get less weight.
 
     The state is predicted over the latency, but not over the further delay `unknown_s` (s).
     """
@@ -202,7 +202,7 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
 def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
     """The parameters of `controller` in a file of `controllers tune`; {} without a file.
 
-    Raises UserError for another kind of file, or one without parameters of the controller.
+    Raises UserError for another kind of file, or for a file without parameters of the controller.
     """
     if path is None:
         return {}

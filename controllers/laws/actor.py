@@ -51,7 +51,8 @@ class ActorCard:
     step: int
     """Step of the training after which this actor was saved."""
     score_per_step: float
-    """Mean reward of its drive on the training track, by which it was chosen."""
+    """Mean reward per step of the actor's drive on the training track; the actor with the largest
+    mean is kept."""
     reward: str = "paper"
     """Name of the reward of the training."""
     format: int = FORMAT
@@ -59,7 +60,10 @@ class ActorCard:
 
 
 class Actor:
-    """state -> ReLU -> ReLU -> tanh; `weights` has the arrays NAMES, matrices (inputs, outputs)."""
+    """The network state -> ReLU -> ReLU -> tanh.
+
+    `weights` has the arrays called NAMES; the matrices are (inputs, outputs).
+    """
 
     def __init__(self, card: ActorCard, weights: dict[str, Array]) -> None:
         self.card = card

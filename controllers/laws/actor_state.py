@@ -1,13 +1,14 @@
 """The state vector that an actor receives; training and driving share its definitions.
 
-`paper`: the paper's seven numbers (`trackfeatures.state_vector`). `stacked`: d/w, angle/pi, v_x and
-v_y over 75 km/h, the class of the road as a number (left 1, straight 0, right -1), the yaw rate
-(rad/s), the changes of the first two since the last step, and the last two steering actions. The
-curvature of the road can be inferred from them; the paper's state does not contain it. LQR also
-receives the yaw rate. `residual`: `stacked` and the steering of the controller `lqr`. 0.3 times the
-actor's action is added to that steering (Johannink et al. 2019, residual reinforcement learning).
-`history`: the paper's state of the last eight steps: that of the present step, and those of the
-seven steps before as differences from it. Noise, delay and the car's motion can be inferred.
+`paper`: the paper's seven numbers (`trackfeatures.state_vector`). `stacked`: d/w (offset over half
+the width of the track), angle/pi, v_x and v_y over 75 km/h, the class of the road as a number (left
+1, straight 0, right -1), the yaw rate (rad/s), the changes of d/w and angle/pi since the last step,
+and the last two steering actions. The curvature of the road can be inferred from these numbers; the
+paper's state does not contain it. LQR also receives the yaw rate. `residual`: `stacked` and the
+steering of the controller `lqr`. 0.3 times the actor's action is added to that steering (Johannink
+et al. 2019, residual reinforcement learning). `history`: the paper's state of the present step, and
+the differences of the states of the seven steps before from it. Noise, delay and the car's motion
+can be inferred from `history`.
 
 Every drive divides the lateral offset by half the width of the track of the training: a controller
 does not know the width of the road, and its gains are per metre.
@@ -39,7 +40,7 @@ class StateDefinition:
     name: str
     parts: tuple[str, ...]
     spread: tuple[float, ...]
-    """Typical size of each number; an algorithm may divide by it."""
+    """Typical size of each number; some algorithms divide the number by it."""
     odd: tuple[float, ...]
     """-1 for a number that changes its sign when left and right are exchanged, 1 otherwise."""
     order: tuple[int, ...]
@@ -105,7 +106,8 @@ def find_state(name: str) -> StateDefinition:
 
 
 def paper_state(seen: Observation, half_width: float) -> Vector:
-    """The paper's state (7,) of an observation; `half_width` of the track of the training in m."""
+    """The paper's state (7,) of an observation; `half_width`: half the width (m) of the track of
+    the training."""
     return state_vector(
         *(seen.to_lane_centre, seen.angle, seen.vx, seen.vy, seen.heading), half_width=half_width
     ).astype(np.float32)
@@ -119,7 +121,7 @@ def history_state(recent: Vector) -> Vector:
 
 
 class StateBuilder:
-    """Builds the state of each step of one drive; it keeps what later states need of this step."""
+    """Builds the state of each step of one drive; it stores the values that later states need."""
 
     def __init__(self, definition: StateDefinition, loop: LoopConfig = EXACT) -> None:
         self._plain = definition.name == PAPER.name
@@ -131,7 +133,7 @@ class StateBuilder:
             from controllers.laws.lqr import (
                 Lqr,
                 approach_limit,
-            )  # scipy; the other states need none
+            )  # loads scipy, which the other states do not need
 
             self._lqr = Lqr(STEP_S, approach_rad=approach_limit(loop))
         self._lqr_steer = 0.0

@@ -1,10 +1,11 @@
 """The delay of a perception, estimated from the car's own yaw rate, compiled. SI units.
 
 The estimate is the number of control steps by which the perceived heading lags behind the measured
-yaw rate. The heading error changes by theta' = r - kappa vx. Its second differences minus those of
-the integrated yaw rate contain the noise, the change of the road's curvature kappa, which is small,
-and for a wrong delay the motion of the car. Their squares are compared for the delays of 0 to
-`MAX_DELAY` steps over the last `WINDOW` steps.
+yaw rate. The heading error theta changes by theta' = r - kappa vx, with the yaw rate r and the
+road's curvature kappa. For each delay of 0 to `MAX_DELAY` steps, the residual is the second
+difference of theta minus the second difference of the integrated yaw rate. It contains the noise,
+the change of kappa, which is small, and for a wrong delay the motion of the car. The squares of the
+residuals are compared over the last `WINDOW` steps.
 """
 
 import math
@@ -21,7 +22,7 @@ Vector = NDArray[np.float64]
 MAX_DELAY = 4
 """Longest delay in control steps: 0.2 s at 20 Hz."""
 SPANS = (1, 4)
-"""Control steps over which second differences are taken: short ones are exact without noise, long
+"""Control steps over which second differences are taken. Short spans are exact without noise. Long
 spans contain more of the motion and no more of the noise."""
 LONGEST = max(SPANS)
 WINDOW, FEWEST = 200, 20
@@ -34,7 +35,7 @@ DELAY_MEMORY = np.dtype(
     [
         # The delay that is assumed: 0 until the measurements contradict it.
         ("steps", np.int64),
-        # Whether it was given, or the measurements ever separated it from all other delays.
+        # Whether the delay was given, or the measurements ever separated it from all other delays.
         ("is_known", np.bool_),
         ("is_given", np.bool_),
         ("count", np.int64),
@@ -51,8 +52,8 @@ DELAY_MEMORY = np.dtype(
 def first_delays(cars: int, dt: float, known_s: float | None = None) -> NDArray[Any]:
     """The memory (N,) of `cars` cars at the start.
 
-    `known_s`: the delay, s, if it is known; then nothing is estimated. Raises UserError if it is
-    longer than `MAX_DELAY` steps of `dt` s.
+    `known_s`: the delay in s, which is then not estimated; None if it is unknown. Raises UserError
+    for a delay of more than `MAX_DELAY` steps of `dt` s.
     """
     memory = np.zeros(cars, DELAY_MEMORY)
     if known_s is not None:
@@ -68,8 +69,11 @@ def first_delays(cars: int, dt: float, known_s: float | None = None) -> NDArray[
 
 @compiled
 def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
-    """One control step of `dt` s with the perceived heading error (rad) and the yaw rate (rad/s) of
-    now. Returns whether the delay, `memory.steps`, changed."""
+    """Update the estimate by a control step of `dt` s; returns whether the delay `memory.steps`
+    changed.
+
+    `theta` is the perceived heading error (rad), `yaw_rate` the present yaw rate (rad/s).
+    """
     if memory.is_given:
         return False
     rates, turned, residuals = memory.rates, memory.turned, memory.residuals
@@ -82,7 +86,7 @@ def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
         turned[k] += 0.5 * dt * (rates[k + 1] + rates[k])
         residuals[0, k] = theta - turned[k]
     memory.count += 1
-    # Before that the residuals contain rates of before the first step.
+    # The first residuals contain rates of before the first step and are not counted.
     count = memory.count - (2 * LONGEST + MAX_DELAY)
     if count <= 0:
         return False
@@ -100,7 +104,8 @@ def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
 
 @compiled
 def decide(memory: Any, compared: Vector, span: int) -> None:
-    """Choose the delay that explains the squares `compared` (n, delays) best, if it is sure."""
+    """Change `memory.steps` to the delay with the smallest mean of the squared residuals `compared`
+    (n, delays), if the difference is at least `SURE` standard errors."""
     n, best = len(compared), 0
     sums = np.zeros(MAX_DELAY + 1)
     for row in range(n):

@@ -33,18 +33,19 @@ STATES, MEASURED = 5, 4
 CAR = LateralModel(
     mass=1230.0, yaw_inertia=1120.0, front_stiffness=125_000.0, rear_stiffness=125_000.0
 )
-"""The car with its fuel; yaw inertia and tyre stiffness as the recorded TORCS laps show them
-(`simulator.vehicle.car`), not the paper's values."""
+"""The car with its fuel. Yaw inertia and tyre stiffness are estimated from the recorded TORCS laps
+(`simulator.vehicle.car`); the paper's values differ."""
 PROCESS_STD = np.array([0.003, 0.0007, 0.02, 0.02, 0.0005])
 """Standard deviations of the model's error in a control step, at `USUAL_M_S` and above."""
 USUAL_M_S, SLOWEST_SHARE = 15.0, 0.1
-"""Below this speed the standard deviations fall in proportion to it, to a tenth at least: the state
-of a slow car changes less in a control step."""
+"""Below USUAL_M_S the standard deviations PROCESS_STD fall in proportion to the speed, to a tenth
+at least: the state of a slow car changes less in a control step."""
 START_STD = np.array([0.1, 0.05, 0.1, 0.1, 0.02])
 LEAST_STD = np.array([1e-3, 2e-4, 1e-2, 1e-3])
 MOST_STD = np.array([0.2, 0.02, 0.12, 0.012])
-"""Limits of the measurements' standard deviations (e, theta, vy, r): the filter always trusts a
-sensor a little, and a car that oscillates does not count as a bad sensor."""
+"""Lower and upper limits of the measurements' standard deviations (e, theta, vy, r). The upper
+limits give each sensor some weight at all times; the oscillation of a car is not taken for noise.
+"""
 NOISE_STEPS = 100
 """Control steps over which the variance of the noise is averaged."""
 THIRD_DIFFERENCE = 20.0
@@ -58,21 +59,23 @@ STATE_MEMORY = np.dtype(
         # vx, vy, yaw rate, wheel angle; newest first.
         ("own", np.float64, (MAX_DELAY + 2, 4)),
         ("recent", np.float64, (4, MEASURED)),
-        # Of (e, theta, vy, r), without limits.
+        # Variance of the noise of (e, theta, vy, r), without limits.
         ("noise_variance", np.float64, MEASURED),
         ("steps", np.int64),
         # The last finite e, theta, vx, vy and yaw rate.
         ("last", np.float64, 5),
     ]
 )
-"""The memory of the estimate of one car; zeros at the start, but for the last speed."""
+"""The memory of the estimate of one car. At the start all fields except the last speed are zero."""
 SPEED = 2
 """Index of vx in the field `last`."""
 
 
 class StateEstimate:
-    """Estimates the states of cars in each control step of `dt` s; `delay_s`: the delay, if it is
-    known."""
+    """Estimates the states of N cars in each control step of `dt` s.
+
+    `delay_s`: the delay of the perception, s; None if it is unknown.
+    """
 
     def __init__(self, dt: float, delay_s: float | None = None) -> None:
         self._dt, self._delay_s = dt, delay_s
@@ -184,7 +187,7 @@ def _transition(speed: float, dt: float) -> Vector:
     block = np.zeros((STATES + 1, STATES + 1))
     block[E, THETA], block[E, V] = speed, 1.0
     block[THETA, R], block[THETA, KAPPA] = 1.0, -speed
-    # The model's rates are e' = vy + vx theta and theta': the columns of e' are those of vy.
+    # The model's rates are e' = vy + vx theta and theta'. Its columns of e' are the columns of vy.
     block[V, V], block[V, R] = lateral[1, 1], turn[1, 0]
     block[R, V], block[R, R] = lateral[3, 1], lateral[3, 3]
     block[V, STATES], block[R, STATES] = wheel[1, 0], wheel[3, 0]
@@ -206,9 +209,9 @@ def advance(
     """One control step of the filter; returns the present state (5,).
 
     `x` (5,) and `covariance` (5, 5) are the state at the moment of the image, `delay` steps ago;
-    both are replaced. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. `seen`: e and
-    theta of the image, first. `variance` (4,): of the measurements. `process` (5,): variance of the
-    model's error.
+    both are updated in place. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. The
+    first two elements of `seen` are e and theta of the image. `variance` (4,): variances of the
+    measurements. `process` (5,): variances of the model's error.
     """
     predict(x, covariance, table, own[delay + 1, 0], own[delay + 1, 3], process)
     correct(x, covariance, V, own[delay, 1], variance[V])
@@ -233,7 +236,8 @@ def predict(
     share = place - low
     step = (1.0 - share) * table[low] + share * table[low + 1]
     before, half = x.copy(), np.zeros((STATES, STATES))
-    # Loops: numba takes half a minute to compile products of matrices, and small ones run slower.
+    # Loops, because numba takes half a minute to compile products of matrices, and products of
+    # small matrices are slower than loops.
     for i in range(STATES):
         x[i] = step[i, STATES] * wheel
         for j in range(STATES):
@@ -245,7 +249,7 @@ def predict(
             covariance[i, j] = process[i] if i == j else 0.0
             for k in range(STATES):
                 covariance[i, j] += half[i, k] * step[j, k]
-    # The sine of the heading error moves the car sideways; at a start it may be large.
+    # The lateral motion depends on the sine of the heading error, which can be large at a start.
     middle = 0.5 * (before[THETA] + x[THETA])
     x[E] += step[E, THETA] * (math.sin(middle) - middle)
 

@@ -1,8 +1,8 @@
 """LQR and MPC on an estimated state: for a perception with noise, delay, or both.
 
-Both act on the state that `controllers.laws.kalman` estimates: the offset and heading error of now,
-lateral speed and yaw rate without their noise, and the curvature of the road. The paper's
-controllers act on what is perceived as it is; with 5 cm of noise they steer to and fro, with a
+Both act on the state that `controllers.laws.kalman` estimates: the present offset and heading
+error, lateral speed and yaw rate without their noise, and the curvature of the road. The paper's
+controllers use the perceived values unchanged. With 5 cm of noise they steer to and fro; with a
 delay of 0.1 s they oscillate.
 
 `LqrKalman` (`lqr-kalman`) minimises the paper's cost plus `wheel_rate` times the squared change of
@@ -41,13 +41,13 @@ from controllers.laws.steering import STEERING_LOCK, steer_for
 from runtime.jit import compiled_for_threads
 
 APPROACH_RAD = 0.3
-"""Largest heading error at which to return to the line."""
+"""Largest heading error (rad) at which the car returns to the line."""
 
 
 WEIGHTS, WHEEL_RATE = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01), 3.0
-"""The paper's cost, and the weight of the squared change of the wheel angle in a control step."""
+"""Weights of the paper's cost and of the squared change of the wheel angle in a control step."""
 WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0), 0.3
-"""The cost and the weight that are used until the delay is known."""
+"""The same weights, used until the delay is known."""
 MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 
 
@@ -78,7 +78,7 @@ class LqrKalman(BatchController):
     ) -> None:
         self.estimate = StateEstimate(dt, delay_s)
         self.wheel_angles: Matrix = np.zeros(0)
-        """rad of the front wheels of each car since the last control step."""
+        """Angle (rad) of the front wheels of each car since the last control step."""
         self._gains = speed_table(lambda speed: smooth_gain(weights, wheel_rate, speed, dt))
         self._cautious = speed_table(
             lambda speed: smooth_gain(WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY, speed, dt)
@@ -156,8 +156,8 @@ def regulate_smoothly(
 def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:
     """The gain K (5,) of the law change = -K x.
 
-    x is (e1, e1', e2, e2', wheel angle) minus the set points of these five. The change, in rad, is
-    the change of the wheel angle over one control step of `dt` s at `speed` m/s.
+    x is (e1, e1', e2, e2', wheel angle) minus the set points of these values. The change, in rad,
+    is the change of the wheel angle over one control step of `dt` s at `speed` m/s.
     """
     A, B = CAR.discretise(speed, dt)
     states = np.block([[A, B], [np.zeros((1, 4)), np.eye(1)]])

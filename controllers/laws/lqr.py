@@ -19,8 +19,8 @@ road.
 `LqrPreview` (`lqr-preview`) adds a feed-forward of the curvature just ahead: a wheel angle, and the
 slip angle of a steady bend as the set point. On perception the curvature is estimated from the yaw
 rate (low-pass filter, sign limited by the class of the road), which removes the steady offset in
-bends. With the errors of a briefly trained network (0.25 m, 0.025 rad) it strays 1.1 m from the
-centre of `town` with the paper's weights and 0.6 m with the softer ones.
+bends. With the errors of a briefly trained network (0.25 m, 0.025 rad) the car strays 1.1 m from
+the centre of `town` with the paper's weights, and 0.6 m with the softer weights.
 
 `LqrPaper` (`lqr-paper`) computes what the paper's released code computes: the continuous gains, and
 steer = -K x / 21. The regulator's angle is in rad but 21 is the lock in degrees, so the car steers
@@ -100,7 +100,8 @@ def make_lqr_paper(loop: LoopConfig, **weights: float) -> "LqrPaper":
 
 
 def approach_limit(loop: LoopConfig) -> float:
-    """Largest heading error (rad) at which to return to the line; no limit on the exact state."""
+    """Largest heading error (rad) at which the car returns to the line; unlimited for the exact
+    state."""
     return APPROACH_RAD if loop.noisy else UNLIMITED_RAD
 
 
@@ -175,15 +176,16 @@ class LqrPaper(BatchController):
         return regulate_as_released(observations.rows, self._gains, self._rates, self.dt)
 
 
-# The compiled laws: `seen` are the rows of `Observations` (N, OBSERVED), `gains` those of a
-# `speed_table`. They return the steering actions (N,).
+# The compiled laws return the steering actions (N,). `seen` are the rows of `Observations`
+# (N, OBSERVED), `gains` the rows of a `speed_table`.
 
 
 @compiled_for_threads
 def regulate(
     seen: Matrix, gains: Matrix, rates: Matrix, dt: float, blend: float, approach_rad: float
 ) -> Matrix:
-    """`Lqr`; `rates` (N, RATE): memory of the rate of the heading error, replaced."""
+    """The law of `Lqr`. `rates` (N, RATE), the memory of the rate of the heading error, is updated
+    in place."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         vx, theta = seen[k, VX], -seen[k, ANGLE]
@@ -211,7 +213,8 @@ def regulate_with_preview(
     filter_s: float,
     approach_rad: float,
 ) -> Matrix:
-    """`LqrPreview`; `curvatures` (N,): estimates where no curvature is measured, replaced."""
+    """The law of `LqrPreview`. `curvatures` (N,), the estimates for cars without a measured
+    curvature, are updated in place."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         vx, theta, yaw_rate = seen[k, VX], -seen[k, ANGLE], seen[k, YAW_RATE]
@@ -235,7 +238,8 @@ def regulate_with_preview(
 
 @compiled_for_threads
 def regulate_as_released(seen: Matrix, gains: Matrix, rates: Matrix, dt: float) -> Matrix:
-    """`LqrPaper`; `rates` (N, 2, RATE): memory of the rates of offset and heading, replaced."""
+    """The law of `LqrPaper`. `rates` (N, 2, RATE), the memory of the rates of offset and heading,
+    is updated in place."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         offset, theta = seen[k, TO_LANE_CENTRE], -seen[k, ANGLE]
@@ -258,9 +262,9 @@ def blend_for(dt: float, filter_s: float) -> float:
 
 @compiled
 def next_rate(memory: Matrix, value: float, dt: float, blend: float) -> float:
-    """The rate of `value` from its difference over a control step, low-pass filtered; 0 at first.
+    """The rate of `value` from its difference over a control step, low-pass filtered.
 
-    `memory` (RATE,) is replaced.
+    The rate of the first value is 0. `memory` (RATE,) is updated in place.
     """
     if memory[0] != 0.0:
         memory[2] += blend * ((value - memory[1]) / dt - memory[2])

@@ -34,28 +34,34 @@ class LqrWeights:
 
 
 def dlqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
-    """Gain K (inputs, states) of u = -K x for x' = A x + B u, cost sum(x'Qx + u'Ru)."""
+    """Gain K (inputs, states) of u = -K x for x[k+1] = A x[k] + B u[k].
+
+    The cost is sum(x^T Q x + u^T R u).
+    """
     P = solve_discrete_are(A, B, Q, R)
     gain: Matrix = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     return gain
 
 
 def clqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
-    """Gain K (inputs, states) of u = -K x for dx/dt = A x + B u, cost integral(x'Qx + u'Ru)."""
+    """Gain K (inputs, states) of u = -K x for dx/dt = A x + B u.
+
+    The cost is integral(x^T Q x + u^T R u).
+    """
     P = solve_continuous_are(A, B, Q, R)
     gain: Matrix = np.linalg.solve(R, B.T @ P)
     return gain
 
 
 def discrete_gain(model: LateralModel, weights: LqrWeights, speed: float, dt: float) -> Matrix:
-    """K (4,) in rad per unit of (e1, e1', e2, e2') at one speed (m/s) and control step (s)."""
+    """Gain K (4,) in rad per unit of (e1, e1', e2, e2') at one speed (m/s) and control step (s)."""
     A, B = model.discretise(speed, dt)
     gain: Matrix = dlqr(A, B, weights.Q, weights.R)[0]
     return gain
 
 
 def speed_table(compute: Callable[[float], Matrix | tuple[float, ...]]) -> Matrix:
-    """Rows (speeds, n) computed at a grid of speeds, for `row_at`."""
+    """The results (speeds, n) of `compute` at each speed (m/s) of the grid, for `row_at`."""
     speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
     return np.array([compute(float(speed)) for speed in speeds])
 
@@ -73,14 +79,17 @@ def row_at(rows: Matrix, speed: float) -> Matrix:
 
 @lru_cache(maxsize=64)
 def discrete_gains(weights: LqrWeights, dt: float) -> Matrix:
-    """The `speed_table` of `discrete_gain` for the paper's car. Cached, because a command may make
-    many equal controllers."""
+    """Gains (speeds, 4) of the discrete regulator for the paper's car, for `row_at`.
+
+    `dt` is the control step (s). The result is cached, because a command can make many equal
+    controllers.
+    """
     return speed_table(lambda speed: discrete_gain(LateralModel(), weights, speed, dt))
 
 
 @lru_cache(maxsize=64)
 def continuous_gains(weights: LqrWeights) -> Matrix:
-    """The `speed_table` of the continuous regulator's gain K (4,) for the paper's car."""
+    """Gains (speeds, 4) of the continuous regulator for the paper's car, for `row_at`."""
 
     def gain(speed: float) -> Matrix:
         A, B, _ = LateralModel().matrices(speed)

@@ -71,7 +71,7 @@ class SpeedHold:
 
     @property
     def mean_error(self) -> float | None:
-        """Mean distance (m/s) from the set-point on free straights; None without free straights."""
+        """Mean absolute speed error (m/s) on free straights; None without free straights."""
         return sum(self._errors) / len(self._errors) if self._errors else None
 
 
@@ -89,7 +89,7 @@ def on_the_truth(speed: float, road: Road, lane_centre: float, dt: float) -> Spe
 
 
 def on_perception(speed: float, dt: float) -> SpeedHold:
-    """Pedals that slow down in bends, which the yaw rate and the perceived class of the road show.
+    """Pedals that slow down in bends, detected by the yaw rate and the perceived class of the road.
 
     The slope is the pitch of the body, as an inclination sensor measures it.
     """

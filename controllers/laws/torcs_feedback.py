@@ -2,8 +2,9 @@
 
 front wheel angle (rad) = -(1.0 d + 0.1 (vy + vx sin theta) + 2.0 theta + 0.1 yaw rate)
 
-The law has no model and no feed-forward. It validates the simulated car: under the same law the
-simulator must drive the same laps as TORCS.
+with the offset d (m, left positive), the speeds vx and vy (m/s, body frame), the heading error
+theta (rad, counter-clockwise) and the yaw rate (rad/s). The law has no model and no feed-forward.
+It validates the simulated car: under the same law the simulator must drive the same laps as TORCS.
 """
 
 import math

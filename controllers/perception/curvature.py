@@ -1,4 +1,4 @@
-"""The road's curvature from the car's own motion, for laws on a perception that lacks it."""
+"""Estimates the road's curvature from the car's own motion, for perceptions without a curvature."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,11 @@ LEFT, RIGHT = int(RoadClass.LEFT), int(RoadClass.RIGHT)
 def next_curvature(
     value: float, yaw_rate: float, vx: float, heading: float, dt: float, filter_s: float
 ) -> float:
-    """The estimate after a control step, from the estimate `value` before it (1/m, left positive):
-    yaw rate over speed, low-pass filtered. Its sign does not contradict the class of the road."""
+    """The estimate (1/m, left positive) after a control step, from the estimate `value` before it.
+
+    It is the yaw rate over the speed, low-pass filtered. Its sign does not contradict the class of
+    the road.
+    """
     turning = yaw_rate / max(vx, SLOWEST_M_S)
     value += dt / (dt + filter_s) * (turning - value)
     if heading == LEFT:

@@ -26,7 +26,7 @@ from trackfeatures.errors import UserError
 World = TypeVar("World")
 
 LOST_S = 1.0
-"""The prediction ends after this time (s) without an answer: the perception is lost."""
+"""Time (s) without an answer after which nothing is predicted: the perception is lost."""
 
 
 @dataclass(frozen=True, slots=True)

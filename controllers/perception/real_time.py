@@ -1,10 +1,10 @@
 """Asynchronous perception in real time: a step uses the newest received answer. SI units.
 
 The thread that steps the world also renders, because an OpenGL context belongs to one thread. A
-second thread sends requests to the model or the service, one at a time; meanwhile only the newest
-image waits. At each control step the newest answer is predicted to the present from the car's own
-motion. The world follows the wall clock: after a control step that took too long, the next steps
-begin at once until the delay is made up.
+second thread sends requests to the model or the service, one at a time. During a request only the
+newest image waits. At each control step the newest answer is predicted to the present from the
+car's own motion. The world follows the wall clock: after a control step that took too long, the
+next steps begin at once until the delay is made up.
 """
 
 import math

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 LOOK_AHEAD_S = 0.1
-"""The ground truth has the curvature this far ahead: about the delay of steering and tyres."""
+"""Driving time (s) ahead at which the ground truth gives the curvature: about the delay of steering
+and tyres."""
 
 
 class FeatureModel(Protocol):
@@ -76,8 +77,8 @@ class LocalModel:
 class ServiceModel:
     """The model of the perception service at `url`; the path may end with /features.
 
-    Raises UserError for a service that does not answer, and DefinitionsMismatch for one of another
-    version of the definitions.
+    Raises UserError for a service that does not answer, and DefinitionsMismatch for a service with
+    another version of the definitions.
     """
 
     def __init__(self, url: str) -> None:
@@ -90,7 +91,7 @@ class ServiceModel:
         self.model_hash = str(card.get("model_hash"))
 
     def predict(self, image: Image) -> dict[str, Any]:
-        return self._client.features(encode(image, "jpeg"))  # as the recorded training images
+        return self._client.features(encode(image, "jpeg"))  # like the recorded training images
 
     def close(self) -> None:
         self._client.close()
@@ -130,13 +131,13 @@ class CameraPerception:
         return self.read(self.ask(self.capture(world)))
 
     def capture(self, world: "World") -> Image:
-        """The image of the present state; call it in the thread that opened the camera."""
+        """The image of the present state. Call it in the thread that opened the camera."""
         image: Image = self.camera.render(world.body_pose(), world.traffic.poses())
         self.image = image
         return image
 
     def ask(self, image: Image) -> dict[str, Any]:
-        """The model's answer; call it in any thread, but in one at a time."""
+        """The model's answer. Call it in any thread, but never in two threads at the same time."""
         return self._model.predict(image)
 
     def read(self, answer: dict[str, Any]) -> Perceived:

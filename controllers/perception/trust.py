@@ -1,19 +1,19 @@
 """A Kalman filter on offset and angle that gives less weight to uncertain answers. SI units.
 
 The state estimate is propagated with the car's own motion to the moment of an answer, then fused
-with the answer. An answer with an ordinary standard deviation replaces the estimate. Above that the
-gain falls with the variance of the answer. An answer without a standard deviation is used
-unchanged.
+with the answer. An answer with an ordinary standard deviation replaces the estimate. For a larger
+standard deviation, the gain falls with the variance of the answer. An answer without a standard
+deviation is used unchanged.
 
-Ordinary answers are not filtered. A filter with their variances reduces the error of the offset by
-30 %, but the score falls from 0.9894 to 0.9881 per step on g-track-3. The reason is the angle: a
+Ordinary answers are not filtered. Filtering them by their variances reduces the error of the offset
+by 30 %, but the score falls from 0.9894 to 0.9881 per step on g-track-3. The reason is the angle: a
 network's angle turns into a bend before the car reaches it (its error has a correlation of -0.76
 with the change of the curvature over the next 0.4 s), which helps a controller without preview.
 
-With this filter, drives on ordinary images keep their score (0.9894). A camera that fails for 15 %
-of the time, half a second each, throws the car off the road in none of three drives on g-track-3
-(72 km/h); without the filter, in all three. In `town` (50 km/h) the score is 0.956 per step,
-without the filter 0.951.
+With this filter, drives on ordinary images keep their score (0.9894). With a camera that fails for
+15 % of the time, half a second each time, the car leaves the road in none of three drives on
+g-track-3 (72 km/h). Without the filter it leaves the road in all three drives. In `town` (50 km/h)
+the score is 0.956 per step with the filter and 0.951 without it.
 """
 
 from dataclasses import dataclass, replace
@@ -39,7 +39,8 @@ class Trust:
     offset_m2: float = 0.0
     angle_rad2: float = 0.0
     untrusted_steps: int = 0
-    """Control steps from the last trusted answer to the last answer; 0 if that was trusted."""
+    """Control steps from the last trusted answer to the last answer; 0 if the last answer was
+    trusted."""
 
     def correct(
         self, known: Perceived | None, answer: Perceived, steps: int, moved_m: float

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path("datasets/driven")
 FIRST_SEED = 1000
-"""The default seed, so that the rounds differ from those of `datagen collect` by default."""
+"""Default seed. It differs from the default of `datagen collect`, so the rounds differ too."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class RecordConfig:
     collect`."""
 
     controller: options.ControllerName = "lqr"
-    model: Annotated[str, f"Model that perceives: {options.MODELS}"] = "default"
+    model: Annotated[str, f"Model on whose answers the car drives: {options.MODELS}"] = "default"
     rounds: Rounds = 12
     frames: Frames = CollectConfig.frames
     out: Annotated[Path, "Dataset folder; an unfinished dataset is continued."] = FOLDER

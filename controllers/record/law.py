@@ -37,12 +37,13 @@ class PerceivedLaw:
         self.restart()
 
     def restart(self) -> None:
-        """Replace the controller and the memory of the road by new ones."""
+        """Make a new controller and a new, empty memory of the road."""
         self._controller: Controller = make_controller(self._name, self._loop)
         self._memory = OffsetMemory(round(HOLD_S / self._loop.dt))
 
     def road_curvature(self, state: CarState) -> float:
-        """0, because the model does not answer it; a controller that needs it estimates it."""
+        """0, because the model does not predict the curvature. A controller that needs it estimates
+        it."""
         return 0.0
 
     def steer(
@@ -67,8 +68,8 @@ class PerceivedLaw:
     def _from_middle(self, to_lane_centre: float, true: float) -> float:
         """The answered offset from the middle of the road; the lane is chosen by the `true` offset.
 
-        It is the lane that brings the answer nearest to `true`, because near a marking the model
-        may answer for the adjacent lane.
+        The chosen lane brings the answer nearest to `true`, because near a marking the model can
+        answer for the adjacent lane.
         """
         road = self._world.road
         centres = (tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes))

@@ -13,19 +13,19 @@ last hidden layer, as in the paper. Deviations from the paper, and settings that
 - The first 1000 steps only fill the replay.
 - `w` is half the width of the track, as in the environment's reward. Other drives divide the offset
   by the `w` of the training, because a controller does not know the width of the road.
-- The target actor drives, an average over the last updates. The best of its drives on the training
-  track decides which actor is saved.
+- The drives use the target actor, an average over the last updates. The actor with the best drive
+  on the training track is saved.
 
 `td3` has further differences: two critics, target noise of 0.02, an update of the actor after every
 second update of the critics, no noise on the state, discount of 0.95, tau of 0.005, learning rates
-that fall to 5 %. Its reward is the paper's minus 1 (also after a terminal state, so the optimal
-policy is the same), times 4. The inputs of its networks are divided by their typical spread. Left
+that fall to 5 %. Its reward is 4 (paper's reward - 1), also after a terminal state, so the optimal
+policy is the same. The inputs of its networks are divided by their typical spread. Left
 and right are exchanged in half of the transitions, and the actor is odd by construction. Its
 episodes have 400 steps and begin at random places and motions.
 
 `ppo` (`controllers.rl.ppo`) always drives many cars, on all tracks and random roads. `ddpg` and
-`td3` may, too (`--envs 256`): the agent and its updates are the same, with 256 transitions for each
-update and one update for eight steps of all cars together.
+`td3` can also drive many cars (`--envs 256`). Then an update has 256 transitions, and there is one
+update for eight control steps, summed over all cars; the agent is the same.
 
 The paper's state contains neither the curvature of the road nor the yaw rate. `--state stacked`
 adds the yaw rate, the changes since the last step and the last two actions. `--state residual` also

@@ -22,7 +22,7 @@ class Replay:
         self.results = np.zeros((capacity, 3), np.float32)
         """Action, reward, and 1 if the episode ended, otherwise 0."""
         self.added = 0
-        """Number of transitions added so far, also of those that were overwritten."""
+        """Number of transitions added so far, including overwritten transitions."""
 
     def __len__(self) -> int:
         return min(self.added, len(self.states))
@@ -109,7 +109,7 @@ class Agent:
     def weights(self) -> dict[str, Array]:
         """The arrays of the target actor as in an actor's file.
 
-        It is an average over the last updates, which steers more smoothly.
+        The target actor is an average over the last updates and steers more smoothly.
         """
         of = layers(self.actor.target.copy(), self.shape)
         flat = {name: array[0] for name, array in of._asdict().items()}

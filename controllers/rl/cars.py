@@ -31,37 +31,38 @@ FRICTION, MASS = (0.8, 1.25), (0.85, 1.15)
 THROTTLES = (THROTTLE, 0.3)
 """Throttle of disturbed cars. With less than THROTTLE a car does not climb alpine-2."""
 DELAYS = 3
-"""A disturbed car sees the road as it was 0 to DELAYS - 1 steps (of 50 ms) ago."""
+"""The perception of a disturbed car is 0 to DELAYS - 1 steps (of 50 ms) late."""
 PERCEIVED = (0, 1, 4, 5, 6)
-"""The numbers of the paper's state that the perception measures; the car's speeds are not late."""
+"""Indices of the numbers in the paper's state that the perception measures. The car's speeds are
+measured without delay."""
 EPISODE_STEPS = (200, 800)
 STANDING = 0.4
 """Share of the cars that start at rest; all other cars start in motion."""
 START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}
 START_SPEED = (0.0, 18.0)
 GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
-"""Multiples of it modulo 1 are spread evenly, whatever the number of tracks."""
+"""Multiples of the golden ratio modulo 1 are spread evenly for any number of tracks."""
 RANDOM_START_M = 3000.0
 """Range of the start on random roads, which differ in length."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """What a control step of N cars led to."""
+    """The result of a control step of N cars."""
 
     last: Array  # (N, size), the states after the step
-    states: Array  # (N, size), the same, but the first states of new episodes
+    states: Array  # (N, size), as `last`, but the first states of cars in new episodes
     privileged: Array  # (N, privileged.SIZE), `privileged_state` before the step
     last_privileged: Array  # (N, privileged.SIZE), the same after the step
     rewards: NDArray[np.float64]  # (N,)
     ended: NDArray[np.bool_]  # (N,), whether the episode reached a terminal state
-    over: NDArray[np.bool_]  # (N,), whether it ended, also by its number of steps
+    over: NDArray[np.bool_]  # (N,), whether the episode ended, also by its number of steps
     offsets_m: NDArray[np.float64]  # (N,), from the middle, left positive
 
 
 class Cars:
-    """N cars on `tracks` (N names). The cars in the mask `disturbed` (N,) have other parameters in
-    each episode.
+    """N cars on `tracks` (N names). The cars in the mask `disturbed` (N,) get new random parameters
+    in each episode.
 
     `starts`: options of the reset; `episode`: least and greatest number of steps of an episode.
     """
@@ -111,7 +112,7 @@ class Cars:
         self._privileged = np.zeros((self.count, privileged.SIZE), np.float32)
 
     def reset(self, seed: int) -> Array:
-        """Begin an episode of each car; all that follows depends on `seed` and the actions."""
+        """Begin an episode of each car. All later steps depend only on `seed` and the actions."""
         self._rng = np.random.default_rng(seed)
         observed, info = self._envs.reset(seed=seed)
         self._begin(self._everyone)
@@ -124,7 +125,7 @@ class Cars:
         observed, rewards, ended, _, info = self._envs.step(self._actions)
         offsets, none = info["to_middle"], np.zeros(self.count, np.bool_)
         if self._quadratic:
-            steers: Any = self._actions[:, 0]  # the formula takes arrays, too
+            steers: Any = self._actions[:, 0]  # the formula also accepts arrays
             running = quadratic_reward(offsets, info["angle"], steers, False)
             rewards = np.where(ended, OFF_TRACK_REWARD, running)
         last = states = self._perceive(observed, info, none)
@@ -165,7 +166,8 @@ class Cars:
     def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
         """The states (N, size); the memory of `new` cars (N,) begins with their present state.
 
-        With `new` cars only their states are valid, and the memory of all other cars is unchanged.
+        If any car is new, only the states of new cars are valid, and the memory of all other cars
+        is unchanged.
         """
         exact = observed.copy()
         exact[:, 0] = info["to_middle"] / self._half_width_m
@@ -208,8 +210,8 @@ def random_cars(
     """`count` cars that start at random positions and speeds. The cars drive alternately on the
     next of `tracks` and on random roads; with one track all cars drive on it.
 
-    `disturbed`: share of the disturbed cars, evenly spread over the tracks; `options`: the options
-    of `Cars` that are not set here.
+    `disturbed`: share of the disturbed cars, evenly spread over the tracks. `options`: further
+    options of `Cars`.
     """
     several = len(tracks) > 1
     pairs = np.arange(count) // (2 if several else 1)

@@ -36,7 +36,7 @@ class Progress:
     evaluated: int = 0
     """Step of the last drive on the training track."""
     best_score: float = float("-inf")
-    """Best reward per step of these drives."""
+    """Largest mean reward per step of a drive on the training track."""
     best_step: int = 0
     """Step of the best drive."""
     curve: list[Row] = field(default_factory=list)
@@ -44,14 +44,14 @@ class Progress:
 
 
 class Learner(Protocol):
-    """Networks in training, with all that the training needs to continue."""
+    """Networks in training, whose state can be stored and restored."""
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """The arrays by name, and counts."""
+        """All arrays and counts that a continued training needs, by name."""
         ...
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
-        """Continue from what `store` returned; KeyError or ValueError for other arrays."""
+        """Restore the result of `store`. Raises KeyError or ValueError for other arrays."""
         ...
 
 

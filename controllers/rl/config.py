@@ -29,7 +29,8 @@ class Algorithm:
     actor_delay: int = 1
     """Updates of the critics per update of the actor."""
     target_noise: float = 0.0
-    """Standard deviation of the noise on the target action; the noise is clipped at 2.5 of it."""
+    """Standard deviation of the noise on the target action; the noise is clipped at 2.5 standard
+    deviations."""
     discount: float = 0.99
     tau: float = 0.001
     """Share of the networks' parameters in the soft update of the target networks."""
@@ -86,10 +87,11 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """The settings of `ppo`; names without a comment are the names of Schulman et al. 2017."""
+    """The settings of `ppo`. Fields without a comment have the names of Schulman et al. 2017."""
 
     discount_length_m: float = 15.0
-    """The discount factor of a step is exp(-distance / this): 0.94 at 65 km/h."""
+    """The discount factor of a step is exp(-distance of the step / discount_length_m): 0.94 at
+    65 km/h."""
     gae_lambda: float = 0.95
     horizon: int = 64
     """Steps of each car between two updates."""
@@ -103,12 +105,13 @@ class PpoSettings:
     max_gradient: float = 0.5
     """Largest norm of the gradient, of the actor and of the critic."""
     first_std: float = 0.14
-    """Standard deviation of the first steering actions; it is learned, and 0.05 at least."""
+    """Standard deviation of the steering actions at the start; it is learned, with a minimum of
+    0.05."""
     state_noise: float = 0.0
     """Standard deviation of the noise on the paper's state."""
     reward_baseline: float = 1.0
     end_steps: int = 32
-    """The baseline is subtracted as often for the steps after a terminal state."""
+    """Number of steps after a terminal state for which the baseline is subtracted, too."""
     reward_scale: float = 1.0
     hidden: tuple[int, int] = (64, 64)
 
@@ -137,8 +140,9 @@ class TrainConfig:
     ] = None
     track: Annotated[
         str | None,
-        "Name of a track (`simulator tracks`), or its file; with several cars also all: half of "
-        "the cars on all tracks, half on random roads. Default: forza with one car, otherwise all.",
+        "Name of a track (`simulator tracks`), or its file. With several cars also all: half of "
+        "the cars drive on all tracks, half on random roads. Default: forza with one car, "
+        "otherwise all.",
     ] = None
     seed: Annotated[int, Option(help="Seed of all random numbers of the training.", min=0)] = 0
     steps: Annotated[
@@ -155,8 +159,8 @@ class TrainConfig:
     disturbed: Annotated[
         float,
         Option(
-            help="With several cars: share with random friction, mass and throttle in each "
-            "episode, and with noise and delay of their state.",
+            help="With several cars: share of the cars that have random friction, mass and "
+            "throttle in each episode, and noise and delay on their state.",
             min=0.0,
             max=1.0,
         ),
@@ -184,8 +188,8 @@ class TrainConfig:
     threads: Annotated[
         int,
         Option(
-            help="Threads that move several cars and train the networks of ppo. The actor does not "
-            "depend on it.",
+            help="Number of threads that move several cars and train the networks of ppo. The "
+            "trained actor does not depend on this number.",
             min=1,
         ),
     ] = 2
@@ -196,12 +200,12 @@ class TrainConfig:
 
     @property
     def vectorised(self) -> bool:
-        """Whether the cars are the cars of a vector environment."""
+        """Whether the training uses a vector environment."""
         return self.algorithm == PPO or (self.envs or 1) > 1
 
 
 def resolve(config: TrainConfig) -> TrainConfig:
-    """`config` with the defaults that depend on other options."""
+    """`config` with the defaults that depend on the number of cars."""
     many = config.vectorised
     defaults: dict[str, Any] = {
         "envs": 256 if many else 1,
@@ -214,7 +218,7 @@ def resolve(config: TrainConfig) -> TrainConfig:
 
 
 def find_settings(config: TrainConfig) -> Algorithm | PpoSettings:
-    """The settings of the algorithm, with the changes of `config`.
+    """The settings of the algorithm, changed by the options in `config`.
 
     Raises UserError for an unknown algorithm and for a learning rate out of range.
     """

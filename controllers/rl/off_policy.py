@@ -13,7 +13,7 @@ from controllers.rl.config import EXPLORATION_NOISE, Algorithm, exploration_shar
 BATCH = 256
 """Transitions per update; a transition takes half the time that it takes in a batch of 64."""
 STEPS_PER_UPDATE = 8
-"""Steps of all cars together for one update."""
+"""Control steps per update, summed over all cars."""
 
 
 class OffPolicy:
@@ -33,7 +33,7 @@ class OffPolicy:
         return self._agent.act_all(self._agent.see(states))
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
-        """Actions (N,) with the paper's noise, which is added with the probability of this step."""
+        """Actions (N,) with the paper's noise. The probability of noise depends on the step."""
         agent, count = self._agent, len(states)
         noise = agent.algorithm.beta * EXPLORATION_NOISE * rng.standard_normal(count, np.float32)
         noise *= rng.random(count) < exploration_share(agent.replay.added)

@@ -1,7 +1,7 @@
 """The folder of a training: its options, its curves, and the best actor.
 
-`config.json` has the options, `curve.csv` and `tensorboard/` (where the package is installed) a
-point for each evaluation, `actor.safetensors` and `actor.json` the best actor.
+`config.json` has the options. `curve.csv` and `tensorboard/` (if the package is installed) have a
+point for each evaluation. `actor.safetensors` and `actor.json` contain the best actor.
 """
 
 import json
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 CONFIG, CURVE, TENSORBOARD = "config.json", "curve.csv", "tensorboard"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 UNCOMPARED = ("out", "threads", "resume")
-"""Options that may differ when a training continues: the folder may have been moved."""
+"""Options that are not compared when a training continues. The folder can have been moved."""
 
 
 def stored_config(run: Path) -> TrainConfig:
     """The configuration of the training in the folder `run`, to continue it.
 
-    Raises UserError if there is none, or if its file is damaged.
+    Raises UserError if the folder has no configuration, or if its file is damaged.
     """
     if not (run / CONFIG).is_file():
         raise UserError(
@@ -63,7 +63,8 @@ def _content(config: TrainConfig) -> dict[str, Any]:
 
 
 def _read(path: Path) -> TrainConfig:
-    """The options in a `config.json`; it lacks those that were added after its training."""
+    """The options in a `config.json`. Options that did not exist at the time of the training get
+    their defaults."""
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8")))
         known = {
@@ -87,7 +88,7 @@ def _open_tensorboard(folder: Path, purge_step: int | None) -> "TensorBoardWrite
 
 
 class RunFolder:
-    """The files of one training, from its checkpoint if it has one."""
+    """The files of one training. An existing checkpoint is loaded."""
 
     def __init__(self, run: Path, learner: Learner) -> None:
         self._run, self._learner = run, learner

@@ -1,4 +1,4 @@
-"""Training of an actor with one car; drives choose the best actor. SI units.
+"""Training of an actor with one car. The actor with the best drive is kept. SI units.
 
 controllers train --algorithm td3 --track forza --seed 0 --out runs/rl
 
@@ -108,7 +108,7 @@ class _Training:
         return self._folder.result()
 
     def _episode(self) -> None:
-        """One episode; each step is followed by an update once the replay has `learning_starts`
+        """Run one episode. An update follows each step once the replay has `learning_starts`
         transitions."""
         progress, algorithm, agent = self._progress, self._algorithm, self._agent
         rng = np.random.default_rng([self._config.seed, 1, progress.episode])
@@ -156,7 +156,7 @@ class _Training:
         }
 
     def _explore(self, action: float, rng: np.random.Generator) -> float:
-        """`action` with the paper's noise, which is added with the probability of this step."""
+        """`action` with the paper's noise. The probability of noise depends on the step."""
         if rng.random() < exploration_share(self._progress.step):
             action += self._algorithm.beta * EXPLORATION_NOISE * rng.standard_normal()
         return min(max(action, -1.0), 1.0)

@@ -38,7 +38,7 @@ class VectorLearner(Learner, Protocol):
     """A learner that drives N cars at once."""
 
     horizon: int
-    """Steps of the cars between two updates; evaluations are after an update."""
+    """Steps of each car between two updates. An evaluation always follows an update."""
     divisor: Array
     odd: bool
 
@@ -58,8 +58,8 @@ def train_vector(
 ) -> dict[str, Any]:
     """Train as the resolved `config` describes, from the checkpoint of the run if it has one.
 
-    Raises UserError for an unknown track, a state that several cars cannot have, or a run of
-    another configuration.
+    Raises UserError for an unknown track, a state that is not supported with several cars, or a run
+    of another configuration.
     """
     definition = find_state(config.state)
     if definition.name not in (PAPER.name, HISTORY.name):
@@ -160,7 +160,7 @@ class _Training:
         self._evaluated.close()
 
     def _segment(self, folder: RunFolder) -> None:
-        """Train until the next evaluation is due, and an update was made."""
+        """Train until the next evaluation is due and an update has been made."""
         progress, learner, cars = folder.progress, self._learner, self._cars
         rng = np.random.default_rng([self._config.seed, 1, len(progress.curve)])
         states = cars.reset(int(rng.integers(2**31)))
@@ -182,8 +182,8 @@ class _Training:
                 self._report(min(progress.step, self._steps), progress.best_score)
 
     def _evaluate(self) -> tuple[float, float, float]:
-        """Reward per step, mean offset and largest offset (m) of the drives without noise, one on
-        each track.
+        """Make a drive without noise on each track; returns the reward per step, the mean offset
+        (m) and the largest offset (m).
 
         As in `controllers drive`, each step after an early end counts 0, or OFF_TRACK_REWARD with
         the quadratic reward.

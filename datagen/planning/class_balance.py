@@ -63,7 +63,8 @@ class TrackForecast:
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
-        """Read the chosen tracks; a random road is made when a round on it is forecast."""
+        """Read the chosen tracks from their files. A random road is made later, for the first
+        forecast of a round on it."""
         named = (c.name for c in choices if c.name != RANDOM)
         return TrackForecast({name: find_track(name, tracks_dir) for name in named})
 

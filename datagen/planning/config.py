@@ -58,8 +58,8 @@ Stretch = Annotated[
 Scenes = Annotated[
     int,
     Option(
-        help="Sceneries that --stretch cycles through in a round; 0: one per "
-        f"{FRAMES_PER_SCENE} frames."
+        help="Number of different sceneries in a round, shown in turn; --stretch sets the frames "
+        f"between two changes. 0: one scenery per {FRAMES_PER_SCENE} frames."
     ),
 ]
 SplitName = Annotated[

@@ -55,9 +55,9 @@ REPORT_SECONDS = 30.0
 
 
 def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False) -> dict[str, Any]:
-    """Run an ablation, or with `dry_run` print its plan; returns the result of `--json`.
+    """Run an ablation, or only plan it with `dry_run`; returns what `mtlnet ablate --json` prints.
 
-    Raises UserError when the folder has other settings, or when a run fails.
+    Raises UserError when the folder contains an ablation with other settings, or when a run fails.
     """
     console = Console(stderr=True, markup=False)
     dataset = open_training_dataset(config.data)

@@ -15,11 +15,13 @@ from trackfeatures.definitions import UNKNOWN_HEADING
 def describe_data(
     dataset: Dataset, frames: Frames, held_out: Frames | None = None
 ) -> dict[str, Any]:
-    """Description of a model's training data; `mean`, the mean of the labels, is the baseline.
+    """Description of a model's training data, for its model card.
 
-    `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks count
-    as seen by the model; `frames` does not include their frames. `mtlnet.inference.trained_rounds`
-    makes the entries `split`, `held_out` and `seeds`.
+    The entry `mean` has the mean labels. Evaluations compare the model with a constant prediction
+    of them, the baseline. `held_out`: rounds on which only the uncertainty head was fitted. Their
+    seeds and tracks count as seen by the model, but the entry `frames` does not count their frames.
+    The format of the entries `split`, `held_out` and `seeds` is defined in
+    `mtlnet.inference.trained_rounds`.
     """
     fitted = held_out.rounds if held_out is not None else []
     rounds = [*frames.rounds, *fitted]

@@ -46,8 +46,8 @@ def evaluate(
     `engines`: the same model once per thread. `report(done, total)` is called after each chunk of
     frames. `page`: an HTML file to write, or its folder; `worst`: a JPEG to write of the frames
     with the largest errors. `every`: evaluate every n-th frame only, because consecutive frames are
-    similar. `copies`: value of `--copies` for a user's own pictures. Raises UserError when data and
-    model do not fit.
+    similar. `copies`: value of `--copies` for a user's own pictures. Raises UserError when the data
+    do not fit the model.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
@@ -118,7 +118,7 @@ def evaluate_custom_images(
 
 
 def about(engine: Engine) -> dict[str, Any]:
-    """The entries of a report about the model."""
+    """The entries of a report that describe the model."""
     return {
         "model": engine.card.name,
         "model_hash": engine.card.model_hash,
@@ -130,8 +130,10 @@ def about(engine: Engine) -> dict[str, Any]:
 def predict_rounds(
     engines: Sequence[Engine], frames: Frames, data: Path, report: Callable[[int, int], None]
 ) -> NDArray[np.float32]:
-    """`predict_frames` for recorded rounds, in metres at the car. Raises DatasetError with the
-    names of all undecodable images."""
+    """The outputs of `predict_frames` for recorded rounds, in metres at the car.
+
+    Raises DatasetError with the names of all undecodable images.
+    """
     try:
         return car_outputs(predict_frames(engines, frames, report), frames)
     except UndecodableImage:

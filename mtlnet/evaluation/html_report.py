@@ -232,7 +232,7 @@ def _caption(frames: Frames, worst: WorstFrame, prediction: Prediction) -> dict[
     note = ""
     if prediction.std is not None:
         std = prediction.std[worst.feature]
-        if std is None:  # absent: the error of the undecoded value
+        if std is None:  # predicted absent; the error is the error of the undecoded value
             note = ", predicted absent"
         else:
             note = f", predicted standard deviation {std:.2g} {unit}"

@@ -69,7 +69,7 @@ def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | 
     """For each feature by name: shares of its errors (N, 7) within one and two of its standard
     deviations (N, 7).
 
-    A normal distribution has 0.683 and 0.954.
+    For normally distributed errors the shares are 0.683 and 0.954.
     """
     ratio = np.abs(errors) / std
     within = [np.where(np.isnan(ratio), np.nan, ratio <= limit) for limit in (1, 2)]
@@ -159,10 +159,10 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: LabelArrays, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on `outputs` (N, K; columns: `split_outputs`) for `labels`; `mean`: from
-    `mean_labels`.
+    """The report on `outputs` (N, K; columns: `split_outputs`) for `labels`.
 
-    It has the key `uncertainty` when the model predicts standard deviations.
+    `mean`: the result of `mean_labels`. The report has the key `uncertainty` when the model
+    predicts standard deviations.
     """
     errors = signed_errors(outputs, labels.distances, labels.angle)
     heading = outputs[:, 6:OUTPUTS].argmax(1)
@@ -245,7 +245,7 @@ def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str,
     known = ~np.isnan(target)
     difference = np.where(known, outputs[:, :6] - target, 0.0)
     squared, absolute = difference**2, np.abs(difference)
-    weight = known[:, :5].size / max(known[:, :5].sum(), 1)  # the mean over the known ones
+    weight = known[:, :5].size / max(known[:, :5].sum(), 1)  # the mean over the known distances
     told = np.flatnonzero(labels.heading != UNKNOWN_HEADING)
     likelihood = outputs[told, 6 + labels.heading[told]].astype(np.float64)
     type_loss = _mean(-np.log(np.maximum(likelihood, 1e-12)))

@@ -46,7 +46,7 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Case:
-    """A picture or copy on the page: its row in the answers, or the reason why it has none."""
+    """A picture or copy on the page, with its row in the answers or the reason for its refusal."""
 
     picture: LabelledPicture
     copy: str
@@ -126,8 +126,8 @@ def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def cases(answers: Answers) -> list[Case]:
     """All pictures and copies, failures first.
 
-    The order: refused pictures, absent answers, then all others by their largest error in units of
-    its feature's mean error.
+    The order: refused pictures, absent answers, then all other pictures by their largest error. An
+    error is divided by the mean error of its feature.
     """
     images = answers.images
     sizes = np.abs(answers.errors)

@@ -151,10 +151,10 @@ def _groups(answers: Answers, name: str) -> Iterator[tuple[str, dict[str, Any]]]
 def part_report(answers: Answers, chosen: Callable[[LabelledPicture, str], bool]) -> dict[str, Any]:
     """Figures of the chosen pictures and copies.
 
-    `mean`, `median`: of the absolute errors; `mean_of_drives`: the mean of the drives' means;
-    `always_median`: the mean error of always answering the median of these labels; `within_std`:
-    the share of errors within one standard deviation, the label's variance added to the predicted
-    one.
+    `mean`, `median`: mean and median of the absolute errors; `mean_of_drives`: the mean of the
+    drives' means; `always_median`: the mean error of always answering the median of the chosen
+    labels; `within_std`: the share of errors within one standard deviation, whose square is the sum
+    of the predicted variance and the label's variance.
     """
     images = answers.images
     pairs = zip(images.pictures, images.copies, strict=True)
@@ -180,7 +180,8 @@ def part_report(answers: Answers, chosen: Callable[[LabelledPicture, str], bool]
 
 
 def _coverage(answers: Answers, rows: Any) -> dict[str, list[float | None]]:
-    """`mtlnet.evaluation.metrics.coverage`, with the labels' variances added to the model's."""
+    """The result of `mtlnet.evaluation.metrics.coverage`, with the labels' variances added to the
+    predicted variances."""
     labels = answers.images.labels.take(rows)
     outputs = answers.outputs[rows]
     std = split_outputs(outputs).std

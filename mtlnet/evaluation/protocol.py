@@ -25,8 +25,9 @@ from trackfeatures.errors import UserError
 PAPER = "paper"
 INTERVALS = 4
 INTERVAL_FRAMES = 200
-"""Number of frames, 10 s at 20 Hz. The paper marks four intervals of heavy shadow on its lap
-without their lengths; here the whole lap is in shadow, so its darkest parts stand for them."""
+"""Number of frames of an interval: 10 s at 20 Hz. The paper marks four intervals of heavy shadow on
+its lap without their lengths. Here the whole lap is in shadow, so the intervals are its darkest
+parts."""
 FOUR = "four darkest intervals"
 DRIVES = {
     ("g-track-3", "heavy-shadow"): "g-track-3, heavy shadow",
@@ -40,7 +41,8 @@ STATED: dict[str, dict[str, float]] = {
     DRIVES["dirt-3", "clear"]: {"distance_m": 0.107, "angle_rad": 0.004},
     "nine tracks, held-out rounds": {"heading_accuracy": 0.9878},
 }
-"""The paper's figures: on g-track-3 and dirt-3 from its text, of MTL 3 from its table II."""
+"""The paper's figures: the figures on g-track-3 and dirt-3 are from its text, the accuracy on nine
+tracks (MTL 3) is from its table II."""
 
 Rows = NDArray[np.int64]
 
@@ -54,10 +56,10 @@ def evaluate_protocol(
 ) -> dict[str, Any]:
     """The report on the held-out rounds; its entry `protocol` has the rows of the paper's table.
 
-    A row is a drive, a part of a drive, or all held-out rounds that are no drive; its `paper` has
-    the paper's figures. `every`: evaluate every n-th frame only. Raises UserError for another
-    protocol and for data without these rounds, ModelError for a model that was trained on them or
-    on dirt-3.
+    A row is for a drive, a part of a drive, or all held-out rounds that are no drive. Its entry
+    `paper` has the paper's figures. `every`: evaluate every n-th frame only. Raises UserError for
+    another protocol and for data without the rounds of the protocol, ModelError for a model that
+    was trained on these rounds or on dirt-3.
     """
     if protocol != PAPER:
         raise UserError(f"there is no protocol {protocol!r}; give {PAPER}")
@@ -86,8 +88,10 @@ def evaluate_protocol(
 
 
 def drive_rows(frames: Frames, data: Path) -> dict[str, Rows]:
-    """Rows of the frames of each drive of `DRIVES`, in order. Raises UserError where a drive is
-    missing, or where there are no other rounds."""
+    """Rows of the frames of each drive of `DRIVES`, in order.
+
+    Raises UserError if a drive is missing, or if all rounds are drives.
+    """
     labels = frames.labels
     found: dict[str, Rows] = {}
     for (track, light), name in DRIVES.items():
@@ -120,8 +124,8 @@ def protocol_rows(
     """The rows of the table: drives, four intervals of heavy shadow, held-out rounds of nine
     tracks.
 
-    `outputs` (N, K; columns: `split_outputs`); `rows`: from `drive_rows`; `held_out`: the report on
-    the other frames.
+    `outputs` (N, K; columns: `split_outputs`); `rows`: the result of `drive_rows`; `held_out`: the
+    report on the held-out rounds that are no drive.
     """
     shaded = rows[SHADED]
     window = max(1, INTERVAL_FRAMES // every)
@@ -162,7 +166,7 @@ def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
 
 
 def drive_figures(outputs: NDArray[np.float32], labels: Labels) -> dict[str, Any]:
-    """The figures of a drive or a part of one: those that the paper states, and some more.
+    """The figures of a drive or of a part of a drive: the figures of the paper, and some more.
 
     `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest errors; `zero_...`:
     the errors of always answering zero, which are the mean sizes of the labels; `absent`: frames

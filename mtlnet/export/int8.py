@@ -170,12 +170,12 @@ def judge(run: Path, data: Path) -> dict[str, Any]:
 
 
 def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]:
-    """Compare the evaluation of a quantised model with that in float32 on the same frames.
+    """Compare the evaluation of a quantised model with the float32 evaluation on the same frames.
 
-    The result has "passed", "failed" (names), "split", "frames", "limits" and "worse" (increase of
-    the error by name). Each marking and the offset from the lane centre must stay within the limit
-    of a distance. Features without labels are not judged; a feature that only one evaluation has
-    fails.
+    The result has the keys "passed", "failed" (names of features), "split", "frames", "limits" and
+    "worse" (increase of the mean error of each feature). The increase for a marking or for the
+    offset from the lane centre is limited by LIMITS["distance_m"]. A feature without labels is not
+    judged. A feature fails if only one of the evaluations has an error for it.
     """
     pairs = {
         **{name: (reference["mae_m"][name], value) for name, value in quantised["mae_m"].items()},

@@ -1,4 +1,5 @@
-"""Reads the images of sources in order: decoded on another thread, fitted to the model's camera."""
+"""Reads the images of files, films, streams and recordings in order. A second thread decodes each
+image and converts it to the view of the model's camera."""
 
 from collections import deque
 from collections.abc import Generator, Iterator

@@ -53,7 +53,7 @@ class TrainConfig:
         str,
         Option(
             help="Method that sets the task weights: fixed (the values of --alpha), uncertainty or "
-            "dwa; the last two use --alpha only to select tasks."
+            "dwa; uncertainty and dwa use --alpha only to select tasks."
         ),
     ] = "fixed"
     recipe: Annotated[

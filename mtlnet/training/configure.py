@@ -81,7 +81,7 @@ def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -
         "config": {
             **values,
             "change_data": False,
-        },  # only for this start: then `data` is the run's dataset
+        },  # not stored: it applies only to this start, after which `data` is the run's dataset
         "recipe": asdict(recipe),
         "data": dict(data),
     }

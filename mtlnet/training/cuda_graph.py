@@ -1,9 +1,9 @@
 """A training step recorded as a CUDA graph and replayed: one launch instead of hundreds.
 
-A replay uses the memory of the recording: each batch is copied into the first one's memory, and
-values that change at every step, such as the learning rate, are tensors on the device. Other
-differences between steps, such as which layers are frozen, are constants of the recording. When
-they change, the step is recorded again: twice in a run of recipe `fast`.
+A replay uses the memory of the recording: each batch is copied into the memory of the first batch,
+and values that change at every step, such as the learning rate, are tensors on the device. Values
+that seldom change, such as the frozen layers, are constants of the recording. When a constant
+changes, the step is recorded again: twice in a run of recipe `fast`.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from mtlnet.data.gpu_cache import DeviceBatch
 from mtlnet.training.losses.multi_task import Losses
 
 WARM_UP = 3
-"""Number of steps before each recording, so that their allocations and the loading of kernels are
-not recorded."""
+"""Number of steps before each recording. Memory is allocated and kernels are loaded in these steps,
+so that the recording does not contain either."""
 
 Work = Callable[[], Losses]
 
@@ -87,7 +87,7 @@ class CudaGraphStep:
         return Losses(*(getattr(losses, f.name).detach().clone() for f in fields(Losses)))
 
     def _copy_in(self, batch: DeviceBatch) -> DeviceBatch:
-        """Copy the batch into the memory of the first one."""
+        """Copy the batch into the memory of the first batch."""
         if self._batch is None:
             self._batch = DeviceBatch(
                 *(getattr(batch, f.name).clone() for f in fields(DeviceBatch))

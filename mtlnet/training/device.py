@@ -41,8 +41,8 @@ def configure_cpu(threads: int, rank: Rank) -> None:
 def subnormals_as_zero() -> Iterator[None]:
     """Within the context, treat numbers below 1e-38 as 0 in this thread and the threads it starts.
 
-    Units that seldom learn have momenta of this size after a few thousand steps. Each costs the CPU
-    about 100 cycles; without this setting a step took 1.9 times as long.
+    Units that seldom learn have momenta of this size after a few thousand steps. Each of these
+    numbers costs the CPU about 100 cycles. Without this setting a step took 1.9 times as long.
     """
     torch.set_flush_denormal(True)
     try:
@@ -54,7 +54,7 @@ def subnormals_as_zero() -> Iterator[None]:
 def keep_freed_memory() -> None:
     """Make glibc keep the memory of freed tensors, which shortens a step by a sixth.
 
-    By default glibc returns it to the kernel, and each step causes 30,000 page faults.
+    By default glibc returns the memory to the kernel, and each step causes 30,000 page faults.
     """
     if not sys.platform.startswith("linux"):
         return

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from trackfeatures.errors import UserError
 
-TIMEOUT = timedelta(minutes=30)  # the others wait while the first process publishes the model
+TIMEOUT = timedelta(minutes=30)  # all other processes wait while the first publishes the model
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None
 def dropout_seed(seed: int, rank: int, step: int = 0) -> int:
     """Seed of torch's generators in process `rank`, for a run that starts or resumes at `step`.
 
-    It differs between processes, which would otherwise draw the same dropout masks for different
-    images. The first process of a new run uses `seed` itself.
+    The seed differs between processes, which would otherwise draw the same dropout masks for
+    different images. The first process of a new run uses `seed` itself.
     """
     if rank == step == 0:
         return seed

@@ -12,7 +12,7 @@ from runtime.tensorboard import TensorBoardWriter
 class CurveLog:
     """Appends points to the curves of `run`; stored points after `step` are dropped first.
 
-    They exist if a run was killed after its last checkpoint.
+    Points after `step` exist if the run was killed after its last checkpoint.
     """
 
     columns = COLUMNS

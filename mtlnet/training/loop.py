@@ -132,8 +132,10 @@ def curve_point(progress: TrainProgress, trainer: Trainer) -> dict[str, float]:
 
 
 def require_finite(window: Sequence[torch.Tensor], step: int) -> None:
-    """Raise UserError when one of the last losses (4,) is not finite; `step`: the number of the
-    last."""
+    """Raise UserError when one of the last losses (4,) is not finite.
+
+    `step`: the number of the last step.
+    """
     for steps_before, losses in enumerate(reversed(window)):
         if not bool(losses.isfinite().all()):
             raise UserError(

@@ -1,9 +1,9 @@
 """Optimizers: SGD, AdamW, or Muon for the large layers with AdamW for all other layers.
 
 Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; with it,
-recipe `fast` needed half the images in short trials. It trains the layers whose matrix is cheap:
-the convolutions, the first shared layer and small shared layers. AdamW trains heads, biases, wide
-shared layers, and torchvision's backbones, whose matrices have few rows.
+recipe `fast` needed half the images in short trials. It trains the layers whose matrix is cheap to
+process: the convolutions, the first shared layer and small shared layers. AdamW trains heads,
+biases, wide shared layers, and torchvision's backbones, whose matrices have few rows.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,8 +18,8 @@ from mtlnet.training.recipes import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
 MUON_MAX_SIDE = 1024
-"""Maximum of the shorter side of a layer's matrix. The cost grows with its square: the side of 4096
-in network `deepdriving` takes two cores twenty seconds per step."""
+"""Maximum of the shorter side of a layer's matrix. The cost of a step grows with the square of this
+side: with the side of 4096 in network `deepdriving` a step takes twenty seconds on two cores."""
 MUON_MAX_SHARED_SIDE = 512
 """Maximum of the longer side of the matrix of a shared layer other than the first."""
 MUON_LR_SCALE = 8.0
@@ -135,9 +135,9 @@ def _groups(
 
 # Muon with its iterations on the Gram matrix, in float32. A step follows the gradient with its
 # singular values made (nearly) equal by five Newton-Schulz iterations. torch's Muon iterates on the
-# whole matrix in bf16, which suits a GPU; on a CPU without bf16 that takes longer than the rest of
-# a training step. Each iteration multiplies by a polynomial of the Gram matrix, so it can run on
-# the small Gram matrix: the large matrix is read twice instead of ten times.
+# whole matrix in bf16, which suits a GPU; on a CPU without bf16 the iterations take longer than the
+# rest of a training step. Each iteration multiplies by a polynomial of the Gram matrix, so it can
+# run on the small Gram matrix: the large matrix is read twice instead of ten times.
 
 
 RMS_OF_ADAMW = 0.2
@@ -147,8 +147,8 @@ RMS_OF_ADAMW = 0.2
 class GramMuon(Muon):
     """Muon for matrices (F, C), with the state of torch.optim.Muon.
 
-    `together`: process the Gram matrices of one size as one batch. This is for a GPU, where each of
-    these small products alone would leave most processors idle.
+    `together`: process the Gram matrices of one size as one batch. This is for a GPU, because the
+    product of a single small matrix would leave most of its processors idle.
     """
 
     def __init__(

@@ -7,7 +7,7 @@ steps. Dropout 0.5 and L2 5e-4 are our choice, because the paper states neither.
 `fast` differs as follows.
 
 - Batch normalisation of the convolutions in training, folded away afterwards: training is several
-times faster. The shared layers have none, because batch statistics add noise to the distances.
+times faster. The shared layers are not normalised: batch statistics add noise to the distances.
 The statistics are frozen in the last part of a run: the last convolutions have only some hundred
 positions per batch, and the network is then trained in the form in which it is used.
 - The first two convolutions are frozen after a part of the run (FreezeOut, Brock et al. 2017): they
@@ -17,7 +17,7 @@ coded angle varies by 0.03 and a coded distance by 0.2, so the angle would hardl
 - Muon for the large layers (`mtlnet.training.optimizers`): in short trials it needed half as many
 images for the same errors. The learning rate warms up, then falls to zero along a cosine. At twice
 the rate the distance errors are larger by 2 to 28 % after 5 minutes on one core and by 9 to 43 %
-after 17. Batches of 64, because Muon's own cost does not depend on the batch.
+after 17. A batch has 64 images, because Muon's own cost does not depend on the size of the batch.
 - Huber losses with gains (`HuberLoss`): `l`, `m` and `r` jump where they become inactive, and a
 squared error favours a value in between.
 - No dropout: it adds noise to outputs that must be accurate to a few per cent.
@@ -28,9 +28,10 @@ scenery.
 `continue`: `fast` starting from a finished model (`--init`), for hours on new frames. Batch
 normalisation is restored first, and the network may get more residual convolutions
 (`mtlnet.model.pretrained`). The first convolution stays frozen. Frames in sharp bends and near a
-change of class, where most errors occur, are drawn twice as often; in a pilot of 5 minutes this
-left 0.89 of the wrong classes and 0.97 of the angle's error. With a learning rate of 1e-3 the model
-forgot more than it learned. The learning rate is constant until the last fifth of the run, then
+change of class, where most errors occur, are drawn twice as often. In a pilot of 5 minutes this
+reduced the number of wrong classes to 0.89 and the angle's error to 0.97 of their former values.
+With a learning rate of 1e-3 the model lost more of its former training than it gained by the new
+frames. The learning rate is constant until the last fifth of the run, then
 falls to zero as one minus a square root (Hägele et al. 2024, "Scaling Laws and Compute-Optimal
 Training Beyond Fixed Training Durations"). So a run that is stopped before that can be prolonged
 (`--resume --minutes`) as if it had been planned longer from the start.
@@ -57,9 +58,9 @@ class HuberLoss:
     Where a distance has two possible values, the minimum is then at the likelier one, while a
     squared error has its minimum in between. The angle does not jump, so its beta is large.
 
-    The gains multiply the terms of distance and angle. Without them the cross-entropy of the class,
-    which stays large, outweighs both: with them the distances are learned far better, and nothing
-    is learned worse (docs/experiments/task-weights.md).
+    The gains multiply the terms of distance and angle. Without gains the cross-entropy of the
+    class, which stays large, outweighs both terms. With gains the distances are learned far better,
+    and no task is learned worse (docs/experiments/task-weights.md).
     """
 
     distance_beta: float
@@ -74,7 +75,7 @@ class Recipe:
 
     name: str
     network: str
-    """Default network of the recipe: the paper's for recipe `paper`."""
+    """Default network of the recipe: the paper's network for recipe `paper`."""
     optimizer: str
     """Optimizer: sgd, adamw or muon (which uses AdamW for small layers)."""
     learning_rate: float
@@ -98,10 +99,10 @@ class Recipe:
     from_model: bool = False
     """Whether the recipe starts from a finished model (`--init`)."""
     gpu_batch: int = 0
-    """Images per step on a GPU, which smaller batches do not fill; 0: as `batch`."""
+    """Images per step on a GPU, because smaller batches leave a part of it idle; 0: as `batch`."""
     fall_from: float | None = None
     """Share of the run up to which the learning rate is constant after the warm-up (adamw, muon).
-    None: it falls along a cosine after the warm-up."""
+    None: the rate falls along a cosine after the warm-up."""
 
 
 HUBER = HuberLoss(distance_beta=0.05)

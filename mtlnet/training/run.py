@@ -87,7 +87,7 @@ def _open_data(
     init = None if config.init is None else open_pretrained(config.init)
     data = open_training_data(config, init[1] if init else None, checked=checked)
     if resumed is not None and list_checkpoints(config.out):
-        init = None  # its weights have been replaced since
+        init = None  # the checkpoint has replaced the weights of this model
     if resumed is not None:
         data = resume_data(config, data, resumed, init[1] if init else None)
     elif init is not None:
@@ -110,7 +110,7 @@ def _train(
     is_first = read_rank().is_first
     checkpoints = list_checkpoints(config.out) if resumed is not None else []
     elapsed_s = load_checkpoint(checkpoints[-1], trainer) if checkpoints else 0.0
-    barrier()  # the first process writes nothing until all have read the checkpoint
+    barrier()  # the first process writes nothing until all processes have read the checkpoint
     if resumed is not None and is_first and read_config(config.out)[0] != config:
         # Otherwise a run that is stopped again would continue with its first options.
         write_config(config, find_recipe(config.recipe), data.about)

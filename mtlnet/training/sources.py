@@ -52,8 +52,9 @@ def open_training_data(
     """Open `config.data`: recorded rounds or a user's own pictures; `init`: the model to start
     from.
 
-    All images are decoded once, so that a damaged one ends the run at its start; `checked`: this
-    was done before. Raises UserError for data that does not fit the network or the model.
+    All images are decoded once, so that a damaged image ends the run at its start. `checked`: the
+    images have been decoded before. Raises UserError for data that does not fit the network or the
+    model.
     """
     normalised = find_recipe(config.recipe).batch_norm
     if init is not None and normalised and find_architecture(init.network).backbone:
@@ -161,11 +162,11 @@ def resume_data(
     earlier: dict[str, Any],
     start: ModelCard | None = None,
 ) -> TrainingData:
-    """The data of a resumed run; if its earlier data was another dataset, that is added to `about`.
+    """The data of a resumed run. An earlier dataset of the run that differs is added to `about`.
 
     `earlier`: the description of the run's data so far. `start`: the model whose weights the run
-    needs again, because it has no checkpoint. Raises ModelError when that is another model than at
-    the first start, or when `data` is another dataset and `config.change_data` is not set.
+    needs again, because it has no checkpoint. Raises ModelError when `start` is another model than
+    at the first start, or when `data` is another dataset and `config.change_data` is not set.
     """
     if start is not None and earlier.get("init") != _origin(start):
         raise ModelError(

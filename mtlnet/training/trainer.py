@@ -84,7 +84,7 @@ class Trainer:
     def seed_dropout(self) -> None:
         """Seed torch's global generators, from which its dropout layers draw their masks.
 
-        These layers do not accept a generator of their own.
+        torch's dropout layers do not accept a generator as an argument.
         """
         if self.recipe.dropout:
             torch.manual_seed(dropout_seed(self.seed, self.rank.index, self.step_number))
@@ -194,7 +194,7 @@ def freeze_batch_norm(network: Network) -> None:
 
 
 def freeze_convolutions(network: Network, count: int) -> None:
-    """Freeze the first `count` convolutions (no gradients) and unfreeze the others."""
+    """Freeze the first `count` convolutions (no gradients) and unfreeze all other convolutions."""
     for number, name in enumerate(network.architecture.convolutions):
         for parameter in network.features.get_submodule(name).parameters():
             parameter.requires_grad_(number >= count)

@@ -37,7 +37,10 @@ class Access:
         self._count_refusal = count_refusal
 
     def refusal(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a POST /features in which no header name occurs twice, else None."""
+        """The refusal of a request POST /features; None if the request is accepted.
+
+        No header name may occur twice in the request.
+        """
         try:
             self._rate_limiter.check(client)
             self._hosts.check(headers)

@@ -58,15 +58,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ImageCamera:
-    """The camera of an image: `camera`, if given; else the model's camera, with the vertical field
-    of view `fov_y_deg` if given."""
+    """The camera of an image: `camera` if it is given, otherwise the model's camera. In the second
+    case `fov_y_deg`, if it is given, replaces the vertical field of view."""
 
     fov_y_deg: float | None = None
     camera: CameraParameters | None = None
 
     def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
         """[left, top, width, height] in px of the part of an image that the model's camera `view`
-        shows; None if that is the whole image, or if the image is warped.
+        shows; None if the part is the whole image, or if the image is warped.
 
         Raises ImageError if an image of this size does not cover what `view` shows.
         """
@@ -334,7 +334,7 @@ def _frame(
 def response_content(
     options: RequestOptions, result: FrameResult, crop: list[int] | None
 ) -> dict[str, Any]:
-    """The answer. For speed it is not validated against the schema here; the tests do that."""
+    """The answer. For speed it is validated against the schema only in the tests."""
     return {
         **result.prediction.as_json(),
         **result.provenance,

@@ -31,7 +31,7 @@ PAUSE_S = 0.001  # pause between windows; without it the engine's thread waits f
 COUNT_BYTES = 1 << 18  # JSON whose values are counted in one step, which bounds the memory
 JSON_MS_PER_BYTE = 1e-4  # time to decode a byte of pixels in JSON
 PIXEL_MS = 1e-6  # time to crop and scale a pixel
-MAX_SIDE = 1 << 31  # limit for the numbers of a shape; much larger ones do not fit into a float
+MAX_SIDE = 1 << 31  # limit for the numbers of a shape; much larger numbers do not fit into a float
 COMMA, BRACKET = b",["
 MAX_LENGTH_DIGITS = 20
 NULL = memoryview(b"null")
@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 
 class _Misplaced(msgspec.Struct, kw_only=True):
-    """Options placed next to `parameters` instead of in it; absent ones are empty."""
+    """Options placed next to `parameters` instead of in it; absent options are empty."""
 
     frame_id: msgspec.Raw = msgspec.Raw()
     stream_id: msgspec.Raw = msgspec.Raw()

@@ -103,9 +103,9 @@ class Client:
         `content_type` is detected from the first bytes if it is None. `stream` names a stream of
         frames, in which a newer frame replaces a queued one. `fov_y_deg` is the vertical field of
         view of the image; the default is the value of the model's camera. `camera` names a camera
-        that the service was started with. `deadline_s` is counted from now: the service drops the
-        frame after it, and until then the request is retried if the service is overloaded, not
-        ready, or restarting.
+        that the service was started with. `deadline_s` is the time from now to the deadline. The
+        service drops the frame after the deadline. Until then the request is retried if the service
+        is overloaded, not ready, or restarting.
         """
         if content_type is None:
             content_type = "image/png" if image.startswith(PNG_SIGNATURE) else "image/jpeg"
@@ -171,7 +171,7 @@ class Client:
             time.sleep(RETRY_S)
 
     def close(self) -> None:
-        """Close the connection; the next request opens a new one."""
+        """Close the connection; the next request opens a new connection."""
         self._connection.close()
 
     def __enter__(self) -> "Client":

@@ -1,7 +1,7 @@
 """The service's log on stderr: each line is a JSON object, with the id of the request.
 
-Rate limits keep clients from filling the disk. Refusals, including those for token, Host, Origin
-and rate, are logged at most once per second for each client and ten times per second for all
+Rate limits keep clients from filling the disk. Refusals of all kinds, also because of token, Host,
+Origin or rate, are logged at most once per second for each client and ten times per second for all
 clients. Equal errors and lines of native libraries are logged at most once per second. With several
 workers each has its share of these rates. The next logged line has the number of omitted lines as
 `suppressed`.

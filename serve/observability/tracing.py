@@ -4,8 +4,8 @@ which contains the spans of the frame's stages.
 A request continues the trace of its `traceparent` header (W3C Trace Context); a frame of a
 WebSocket continues the trace of the handshake. Probes, pages, requests refused before they are read
 (rate, token) and requests of clients that disconnect have no span. Attributes follow the semantic
-conventions for HTTP; additional ones start with `driverview.`. This module is imported only if
-traces are enabled (`serve.observability.telemetry`).
+conventions for HTTP; additional attributes start with `driverview.`. This module is imported only
+if traces are enabled (`serve.observability.telemetry`).
 """
 
 import time
@@ -79,8 +79,8 @@ class RequestTracer:
                 _set_problem(own, problem, request_id)
 
     def traced(self, app: App, paths: Collection[str]) -> App:
-        """`app` with a span for each POST to one of `paths`. What it does for a WebSocket continues
-        the trace of the handshake."""
+        """`app` with a span for each POST to one of `paths`. The spans of a WebSocket's frames
+        continue the trace of its handshake."""
 
         async def call(scope: Scope, receive: Receive, send: Send) -> None:
             if scope["type"] == "websocket":

@@ -14,7 +14,7 @@ from serve.problems import OVERLOADED, Problem
 from serve.scheduling.fair_queue import FairQueue
 
 MAX_PENDING_MS = 1000.0  # cost of all unfinished large images of all clients
-MAX_CLIENT_MS = 250.0  # cost of all unfinished large images of a client; one is always allowed
+MAX_CLIENT_MS = 250.0  # cost of a client's unfinished large images; one image is always allowed
 SHARE = 0.25  # share of the engine's time for a client's large images if other clients are present
 MAX_BESIDE_MS = 200.0  # cost of one image if other clients are present: four frames at 20 Hz
 MAX_CLIENTS = 1024  # number of clients whose credit is remembered

@@ -1,7 +1,7 @@
-"""Limits for request bodies: the size of one, and the memory of all requests of all workers.
+"""Limits for request bodies: the size of one body, and the memory of all bodies of all workers.
 
 Each worker writes its number of bytes into its block of the shared memory. There is no lock, so
-simultaneous requests in different workers can exceed the budget by a body each. If the budget is
+simultaneous requests in different workers can each exceed the budget by a body. If the budget is
 exhausted, requests whose bodies arrive slowly are ended in favour of small bodies. Otherwise a few
 clients that withhold the last bytes of large bodies could block all other clients.
 """

@@ -1,6 +1,7 @@
 """A queue of frames in which clients take turns.
 
-If the queue is full, the client with the most frames in it loses one to a client with fewer frames.
+If the queue is full, a new frame of a client with few frames replaces a frame of the client with
+the most frames.
 A client is an IPv4 address or an IPv6 /64 network.
 """
 
@@ -33,7 +34,7 @@ class FairQueue:
         self._turns: dict[str, int] = {}  # number of the latest turn of each client
         self._turn = 0
         self._newest: tuple[str, int] = ("", -PRESENT_NS)  # latest client, time in ns
-        self._other: tuple[str, int] = ("", -PRESENT_NS)  # the latest other client, time in ns
+        self._other: tuple[str, int] = ("", -PRESENT_NS)  # the client before `_newest`, time in ns
         self.count = 0
         """Number of slots."""
 

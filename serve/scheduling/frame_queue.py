@@ -34,7 +34,7 @@ from serve.scheduling.streams import StreamTable
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
 INLINE_MAX_MS = 10.0  # longest time per frame at which frames are processed on the event loop
-LARGE_MS = 30.0  # images with a longer decoding time need an admission; a JPEG of 3 Mpx has this
+LARGE_MS = 30.0  # a longer decoding time needs an admission; 30 ms is the time of a JPEG of 3 Mpx
 INLINE_AFTER = 8  # consecutive frames within INLINE_MAX_MS before the event loop runs the engine
 
 logger = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class FrameQueue:
         self._wake_ups: SimpleQueue[bool] = SimpleQueue()  # True: frames wait; False: stop
         self._mean_frame_ms = 5.0
         self._fast_engine: LoadedEngine | None = None  # the engine of the latest frame
-        self._fast_frames = 0  # its latest consecutive frames within INLINE_MAX_MS
+        self._fast_frames = 0  # number of its latest consecutive frames within INLINE_MAX_MS
         self._thread = threading.Thread(target=self._run_thread, name="forward", daemon=True)
 
     @property
@@ -97,7 +97,7 @@ class FrameQueue:
         return self._waiting.count
 
     def start(self) -> None:
-        """Start the thread, which warms up the engine; `check_ready` raises until that is done."""
+        """Start the thread, which warms up the engine. `check_ready` raises until that is done."""
         self._loop = asyncio.get_running_loop()
         self._thread.start()
 
@@ -148,7 +148,7 @@ class FrameQueue:
     def refusal(self, client: str) -> Problem | None:
         """The problem if the queue has no room for a client's frame, else None.
 
-        Many frames share this object: whoever raises it must drop its traceback.
+        Many frames share this object, so code that raises it must drop its traceback afterwards.
         """
         if not self.full:
             return None

@@ -1,4 +1,4 @@
-"""An engine as the frame queue holds it: in use, or loaded to replace the one in use."""
+"""An engine as the frame queue holds it: in use, or loaded to replace the engine in use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

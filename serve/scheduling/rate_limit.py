@@ -60,7 +60,7 @@ class RateLimiter:
         cells[at + 1] = left - 1.0
 
     def _bucket(self, key: float, now: float) -> int:
-        """Index of the client's bucket; a new client gets a full bucket in place of the oldest."""
+        """Index of the client's bucket. A new client gets the oldest bucket, filled again."""
         cells = self._cells
         first = int(key) % CLIENT_ENTRIES
         indices = [(first + n) % CLIENT_ENTRIES * CLIENT_WORDS for n in range(PROBES)]

@@ -10,7 +10,7 @@ from hashlib import blake2b
 
 from serve.shared_memory import PROBES, STREAM_ENTRIES, STREAM_WORDS
 
-EXPIRY_NS = 10_000_000_000  # then another stream can use the entry; no frame waits so long
+EXPIRY_NS = 10_000_000_000  # age at which another stream can use the entry; all frames wait less
 
 
 @lru_cache(4096)

@@ -63,14 +63,14 @@ class GuardedProtocol(HttpToolsProtocol):
         self._deadline_s = inf
         self._idle_group = guard.idle
         self.upgrading = False
-        self._running: Any = None  # the request being answered; `cycle` is the last one received
+        self._running: Any = None  # the request being answered; `cycle` is the last request
         self._fault: Problem | None = None  # why a callback has stopped the parser
         self._body_lingers = False  # the last reply was sent before the request's end arrived
         self._trailer_bytes = self._chunks = 0
         self._part_bytes = self._part_requests = 0  # of the latest part
         # Bytes since the last complete request, including the part in which that request ended.
         self._unread_bytes = 0
-        self._known_bytes = 0  # of `_unread_bytes`, those up to the latest part with body bytes
+        self._known_bytes = 0  # the share of `_unread_bytes` up to the latest part with body bytes
 
     @property
     def lingers(self) -> bool:
@@ -169,7 +169,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def feed(self, data: bytes) -> int | None:
         """Parse `data`. Returns the offset after the headers of a request with an upgrade, or None
-        if there is no such request."""
+        if `data` has no request with an upgrade."""
         try:
             self.parser.feed_data(data)
         except HttpParserUpgrade as upgrade:

@@ -18,7 +18,7 @@ from serve.server.connection import MAX_AT_ONCE, GuardedProtocol, Phase
 
 CLOSE_HEADER: Header = (b"connection", b"close")
 SMALL_BYTES = 1024  # smaller parts of a body are joined: one object for each needs more memory
-TOGETHER_BYTES = 1 << 16  # size at which a joined object ends: growing a long one copies it
+TOGETHER_BYTES = 1 << 16  # size at which a joined object ends: growing a long object copies it
 BODY, CLOSING = Phase.BODY, Phase.CLOSING
 OK, UNAVAILABLE = HTTPStatus.OK.value, HTTPStatus.SERVICE_UNAVAILABLE.value
 ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})

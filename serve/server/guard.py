@@ -1,9 +1,9 @@
-"""What the connections of one worker share: limits, a clock, and the choice of connections to end.
+"""State shared by the connections of one worker: limits, a clock, the choice of connections to end.
 
 Each connection is in one group, according to what it waits for; a group is ordered by the time of
 waiting, longest first. If the number of connections is at its limit, a new connection ends an old
 one, in this order: refused connections that linger, requests that arrive slowly, connections idle
-for longest (first those that never had an image answered), WebSockets without messages. A new
+for longest (first the connections without any answered image), WebSockets without messages. A new
 connection never ends a connection of a client that has fewer connections than its own client.
 """
 
@@ -38,7 +38,7 @@ class Guarded(Protocol):
     """The client's network; empty for a trusted proxy, which has many clients."""
 
     def give_way(self) -> None:
-        """End the connection to make room for a new one."""
+        """End the connection to make room for a new connection."""
 
     def expire(self, now: float) -> None:
         """End the connection if its deadline has passed."""
@@ -54,11 +54,11 @@ class Drained(Guarded, Protocol):
     """Whether the last bytes were sent and the client has not closed the connection yet."""
 
     def begin_draining(self) -> None:
-        """Announce in the next reply that it is the last one."""
+        """Announce in the next reply that it is the last reply."""
 
     def drain(self, elapsed_s: float) -> bool:
         """Close the connection if all replies to its client have been sent, `elapsed_s` after
-        `begin_draining`. Returns whether all have been sent."""
+        `begin_draining`. Returns whether all replies have been sent."""
 
     def end_draining(self) -> None:
         """End the connection; refuse the requests that are still unanswered."""
@@ -178,8 +178,8 @@ class ConnectionGuard:
         return ended
 
     def _count(self, connection: Guarded) -> int:
-        """The number of connections of this connection's client. Behind a trusted proxy it is 1:
-        each connection can be another client's."""
+        """The number of connections of this connection's client. Behind a trusted proxy it is 1,
+        because each connection can belong to a different client."""
         return self.open[connection.network] if connection.network else 1
 
     def end_slow_bodies(self, size: float) -> float:

@@ -30,7 +30,7 @@ from serve.shared_memory import WorkerPeers
 GRACE_S = 5  # time for requests in progress when the service stops
 LAST_S = 1.0  # time after GRACE_S for clients to read why they got no answer
 DRAIN_STEP_S = 0.02
-YIELD_S = 0.002  # pause in which a worker with fewer connections can accept a new one
+YIELD_S = 0.002  # pause in which a worker with fewer connections can accept a new connection
 ACCEPTS_AT_ONCE, ACCEPTS_PER_S = 32, 1_000  # more would delay the requests of other clients
 ACCEPT_PAUSE_S = 0.004  # pause in accepting after too many new connections
 TRIM_TICKS = 50  # ticks of 0.1 s between two trims of the heap
@@ -91,8 +91,8 @@ class WorkerServer(uvicorn.Server):
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Called ten times per second. Close expired connections, and one connection if another
-        worker asked for room; publish this worker's status."""
+        """Close expired connections, and one connection if another worker asked for room; publish
+        this worker's status. uvicorn calls this method ten times per second."""
         self._close_expired()
         self._make_room_for_others()
         self._publish_status()
@@ -103,7 +103,7 @@ class WorkerServer(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop accepting connections, then finish the requests of the open connections.
 
-        Other workers accept new connections, or the supervisor if the service stops.
+        New connections are accepted by other workers, or by the supervisor if the service stops.
         """
         self._remove_readers()
         self.guard.draining = True

@@ -61,7 +61,7 @@ class Supervisor:
         self._folder = plan.resolve(plan.model)
         self._model = plan.model
         self._model_hash: str | None = None
-        self._last_generation = 0  # of all reloads, failed ones included
+        self._last_generation = 0  # of all reloads, including failed reloads
         self._change_lock = asyncio.Lock()
         self._stopping = asyncio.Event()
         self._has_terminal = _has_terminal()
@@ -128,15 +128,15 @@ class Supervisor:
         await self._stop_workers()
 
     async def _stop_workers(self) -> None:
-        """Stop all workers, then close the listening sockets. Connections that arrive before that
-        are answered with 503."""
+        """Stop all workers, then close the listening sockets. Connections that arrive in the
+        meantime are answered with 503."""
         last_answers = LastAnswers(self._listeners)
         last_answers.start()
         await asyncio.gather(*(worker.stop(STOP_TIMEOUT_S) for worker in self._workers.values()))
         await last_answers.finish()
 
     async def reload(self, model: str | None = None) -> str:
-        """Load `model` (None: the current one again) in all workers, then switch to it.
+        """Load `model` (None: the current model again) in all workers, then switch to it.
 
         Returns the hash of the weights. Raises UserError; the old weights then stay in use.
         """
@@ -178,8 +178,8 @@ class Supervisor:
     async def restart(self) -> None:
         """Replace the workers one by one; each old worker is stopped once its successor is ready.
 
-        Raises UserError if a new worker does not become ready. It is stopped then, and the old
-        worker stays.
+        Raises UserError if a new worker does not become ready. Then the new worker is stopped, and
+        the old worker stays.
         """
         async with self._change_lock:
             for position, old in list(self._workers.items()):

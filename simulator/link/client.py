@@ -1,4 +1,4 @@
-"""A client of the link in Python.
+"""A Python client of the shared-memory link to the simulator.
 
     from simulator.link.client import Link
     from simulator.vehicle.state import Command
@@ -8,7 +8,7 @@
         while message.ended is None:
             message = link.step(Command(steer=-0.5 * message.state.to_middle, throttle=0.2))
 
-Give one Link to one thread of one process.
+Use a Link in only one thread of one process.
 """
 
 import math

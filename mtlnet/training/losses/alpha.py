@@ -40,7 +40,7 @@ def parse_alpha(text: str) -> Alpha:
 
 
 def require_method(name: str) -> str:
-    """The method called `name`. Raises UserError when there is no such method."""
+    """`name`, if a method has this name; otherwise raises UserError."""
     if name not in METHODS:
         raise UserError(f"there is no balance {name!r}; choose one of {', '.join(METHODS)}")
     return name

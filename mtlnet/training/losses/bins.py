@@ -28,7 +28,7 @@ def bins_loss(
     """Losses of scores for targets coded (B, 6) and heading (B,); `auxiliary` is added to the
     total.
 
-    The reported losses are squared errors of the coded answers, as for any other network. An
+    The reported losses are squared errors of the coded answers, as for networks without bins. An
     unknown label has no loss, as in `mtlnet.training.losses.multi_task`.
     """
     known, weight = known_targets(coded)

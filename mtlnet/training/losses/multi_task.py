@@ -27,7 +27,7 @@ Terms = Sequence[Tensor]
 class Losses:
     """The unweighted loss of each task, as reported, and the weighted sum that training minimises.
 
-    `terms` (3,): the term of each task in that sum, before its weight.
+    `terms` (3,): the term of each task in the weighted sum, before its weight.
     """
 
     distance: Tensor
@@ -83,8 +83,8 @@ def known_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def heading_loss(scores: Tensor, heading: Tensor) -> Tensor:
-    """Cross-entropy of scores (B, 3) for classes (B,), mean over the known classes; 0 without
-    any."""
+    """Cross-entropy of scores (B, 3) for classes (B,), mean over the known classes; 0 if no class
+    is known."""
     total = cross_entropy(scores, heading, ignore_index=UNKNOWN_HEADING, reduction="sum")
     return total / (heading != UNKNOWN_HEADING).sum().clamp_min(1)
 

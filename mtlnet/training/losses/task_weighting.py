@@ -8,9 +8,9 @@ learned with the network; a squared error L contributes exp(-s) L / 2 + s / 2, a
 exp(-s) L + s / 2.
 
 `dwa`, dynamic weight average (Liu, Johns and Davison 2019, equation 7): a task whose loss falls
-more slowly gets more weight, K exp(r / T) / sum(exp(r / T)). Here r is the ratio of the mean term
-over the last window of steps to that over the window before, K the number of tasks and T = 2. A
-window is an epoch, or `WINDOW_STEPS` if that is shorter.
+more slowly gets more weight, K exp(r / T) / sum(exp(r / T)). Here r is the mean loss term over the
+last window of steps divided by the mean over the window before it, K is the number of tasks, and
+T = 2. A window is an epoch, or `WINDOW_STEPS` if that is shorter.
 """
 
 import torch
@@ -27,7 +27,7 @@ WINDOW_STEPS = 500
 
 
 class TaskWeighting:
-    """The task weights at the current step, and the state they depend on."""
+    """The task weights at the current step, and the state on which the weights depend."""
 
     def __init__(
         self, method: str, alpha: Alpha, device: torch.device, steps_per_epoch: int = WINDOW_STEPS
