@@ -67,8 +67,10 @@ def test_the_papers_roads_are_recorded_as_before(
     path = tmp_path / "round.mcap"
     plan = make_plan(config())
     record_round(plan.rounds[1], plan.hash, path, None)
-    # The hash of the round's images and labels.
-    assert open_round(path).result.content_hash == BEFORE["contents"][1]
+    # The hash of the round's images and labels. It differs on a processor without AVX-512, whose
+    # hash was stored later, at 453de30.
+    expected = (BEFORE["contents"][1], BEFORE["content_without_avx512"])
+    assert open_round(path).result.content_hash in expected
 
 
 def test_varied_roads_are_drawn_for_each_round_and_scene() -> None:
