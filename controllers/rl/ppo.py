@@ -327,7 +327,10 @@ class Ppo:
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
         """Continue from the arrays of a checkpoint."""
         for name, parameter, moments in self._parameters():
-            parameter.data.copy_(torch.from_numpy(tensors[f"policy.{name}"]))
+            stored = torch.from_numpy(tensors[f"policy.{name}"])
+            if stored.shape != parameter.shape:
+                raise ValueError(f"{name} has the shape {tuple(stored.shape)}")
+            parameter.data.copy_(stored)
             for part in ("step", "exp_avg", "exp_avg_sq"):
                 moments[part] = torch.from_numpy(tensors[f"adam.{name}.{part}"].copy())
 

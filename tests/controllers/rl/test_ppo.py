@@ -237,3 +237,15 @@ def test_the_history_has_the_last_eight_states() -> None:
     assert HISTORY.parts[:9] == (*PAPER.parts, "d_1", "angle_1")
     assert HISTORY.order[:8] == (0, 1, 2, 3, 6, 5, 4, 7)
     assert math.isclose(HISTORY.spread[7 * 3], 0.03)
+
+
+def test_a_checkpoint_of_another_network_is_refused() -> None:
+    """The critic of an earlier program had no privileged state and one output."""
+    ppo = Ppo(PpoSettings(horizon=1, minibatches=1), PAPER, 8, 0)
+    states = RNG.normal(size=(8, 7)).astype(np.float32)
+    step = step_of(states, RNG.normal(size=8), np.zeros(8, np.bool_))
+    ppo.learn(states, RNG.normal(size=8).astype(np.float32), step, RNG, 1.0)
+    tensors, counts = ppo.store()
+    tensors["policy.critic.4.weight"] = tensors["policy.critic.4.weight"][:1]
+    with pytest.raises(ValueError, match=r"critic\.4\.weight has the shape \(1, 64\)"):
+        ppo.restore(tensors, counts)
