@@ -89,8 +89,7 @@ def drive(
     lane = choose_lane(config, road)
     steps = steps_for(config.steps, track.name, track.length_m)
     noisy = config.perception != "truth"
-    # Answers to images are already predicted to the present. The controller does not know the delay
-    # of a disturbance.
+    # Answers to images are predicted to the present; the delay of a disturbance is not known.
     delay_s = 0.0 if noisy and disturbance is None else None
     loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy, delay_s=delay_s)
     if parameters is None:

@@ -7,7 +7,7 @@ from controllers.laws.actor_state import STEP_S
 
 Array = NDArray[np.float32]
 SLOWEST_M_S = 1.0
-"""A slower car is taken for one of this speed, so that its discount factor is below 1."""
+"""Least speed for the discount factor, which would be 1 for a car at rest."""
 
 
 def advantages_of(

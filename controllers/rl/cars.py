@@ -129,19 +129,16 @@ class Cars:
             running = quadratic_reward(offsets, info["angle"], steers, False)
             rewards = np.where(ended, OFF_TRACK_REWARD, running)
         last = states = self._perceive(observed, info, none)
-        privileged, self._privileged = self._privileged, self._exact()
-        last_privileged = self._privileged
+        before, self._privileged = self._privileged, self._exact()
+        after = self._privileged
         self._left -= 1
         over = ended | (self._left <= 0)
         if over.any():
             observed, info = self._envs.reset(options={"reset_mask": over})
             self._begin(over)
             states = np.where(over[:, None], self._perceive(observed, info, over), last)
-            self._privileged = np.where(over[:, None], self._exact(), last_privileged)
-        return Step(
-            *(last, states, privileged, last_privileged),
-            *(rewards, ended, over, offsets),
-        )
+            self._privileged = np.where(over[:, None], self._exact(), after)
+        return Step(last, states, before, after, rewards, ended, over, offsets)
 
     def close(self) -> None:
         self._envs.close()

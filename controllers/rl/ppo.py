@@ -7,8 +7,8 @@ standard deviation that does not depend on the state. Advantages are generalised
 - The hidden layers have ReLU, and the mean action is odd: half the difference between tanh of the
   network's outputs for the state and for its mirror image. So the actor's files are those of `td3`.
 - An episode that is cut by its number of steps continues with the value of its last state.
-- The discount factor of a step falls with the distance driven, not with time: a slow car needs
-  more steps, but not more metres, until it gains by its return to the middle.
+- The discount factor of a step depends on the distance driven in it, not on its duration: a slow
+  car needs more steps, but not more metres, to return to the middle of the road.
 - Advantages are divided by their typical size in the state, which the critic's second output
   learns: at the start, where the car is slow, they are small but cost most of the score. Then they
   are divided by their mean distance from their mean, not by their standard deviation, and limited
@@ -42,10 +42,11 @@ from controllers.rl.config import PpoSettings
 
 ADAM_EPSILON = 1e-5
 SIZE_FLOOR, SIZE_WEIGHT = 0.01, 0.1
-"""Added to the size of an advantage before its logarithm is learned; weight of this loss."""
+"""SIZE_FLOOR is added to the size of an advantage before the logarithm is taken. SIZE_WEIGHT is the
+weight of the logarithm's loss beside the value's loss."""
 ADVANTAGE_LIMIT = 4.0
 V_X_AT = privileged.PARTS.index("v_x") - privileged.SIZE
-"""Place of the speed in a state with its privileged state."""
+"""Index of v_x, counted from the end, in a state that is followed by its privileged state."""
 LEAST_STD = 0.05
 """Least standard deviation of the steering actions; a learned one falls to 0.02 within 1.5 million
 steps, and the score stands still from then on."""
@@ -154,17 +155,18 @@ class Ppo:
         seed: int,
         threads: int = 1,
     ) -> None:
-        """With 2 threads or more, actor and critic are updated at the same time; the networks do
-        not depend on it."""
+        """With 2 threads or more, actor and critic are updated at the same time. The networks do
+        not depend on `threads`."""
         self.settings, self.odd = settings, True
         self.horizon = settings.horizon
         self.policy = Policy(definition, settings, torch.Generator().manual_seed(seed))
-        self._actor = [*self.policy.actor.parameters(), self.policy.log_std]
-        self._critic = list(self.policy.critic.parameters())
-        self._adams = [
-            torch.optim.Adam(part, eps=ADAM_EPSILON, fused=True)
-            for part in (self._actor, self._critic)
-        ]
+        self._actor_adam, self._critic_adam = (
+            torch.optim.Adam(parameters, eps=ADAM_EPSILON, fused=True)
+            for parameters in (
+                [*self.policy.actor.parameters(), self.policy.log_std],
+                list(self.policy.critic.parameters()),
+            )
+        )
         self._beside = ThreadPoolExecutor(1) if threads > 1 else None
         self.divisor = np.array(definition.spread, np.float32)
         self._rollout = Rollout.empty(self.horizon, cars, definition.size)
@@ -193,15 +195,15 @@ class Ppo:
         row.states[k] = np.hstack((states / self.divisor, step.privileged))
         row.last[k] = np.hstack((step.last / self.divisor, step.last_privileged))
         row.actions[k] = actions
-        missing = of.reward_baseline * (1 + of.end_steps * step.ended)
-        row.rewards[k] = of.reward_scale * (step.rewards - missing)
+        baseline = of.reward_baseline * (1 + of.end_steps * step.ended)
+        row.rewards[k] = of.reward_scale * (step.rewards - baseline)
         row.ended[k], row.over[k] = step.ended, step.over
         self._filled = (k + 1) % self.horizon
         if self._filled:
             return {}
         share = of.rate_end + (1.0 - of.rate_end) * left
-        for adam, rate in zip(self._adams, (of.actor_rate, of.critic_rate), strict=True):
-            adam.param_groups[0]["lr"] = rate * share
+        self._actor_adam.param_groups[0]["lr"] = of.actor_rate * share
+        self._critic_adam.param_groups[0]["lr"] = of.critic_rate * share
         return self._update(rng)
 
     def _update(self, rng: np.random.Generator) -> dict[str, float]:
@@ -274,7 +276,7 @@ class Ppo:
             actions, before, gained = chosen.unbind(1)
             log_ratio = log_density(actions, self._means(batch), policy.log_std) - before
             loss = clipped_loss(log_ratio, scaled(gained), self.settings.clip)
-            self._descend(loss, 0)
+            self._descend(loss, self._actor_adam)
             with torch.no_grad():
                 policy.log_std.clamp_(min=math.log(LEAST_STD))
                 kl = (log_ratio.exp() - 1.0 - log_ratio).mean()
@@ -290,7 +292,7 @@ class Ppo:
         losses = []
         for batch, targets in self._minibatches(orders, states, wanted):
             value, size = 0.5 * ((self.policy.critic(batch) - targets) ** 2).mean(dim=0)
-            self._descend(value + SIZE_WEIGHT * size, 1)
+            self._descend(value + SIZE_WEIGHT * size, self._critic_adam)
             losses.append(value.item())
         return float(np.mean(losses))
 
@@ -301,12 +303,12 @@ class Ppo:
             parts = (part[order].chunk(self.settings.minibatches) for part in (states, targets))
             yield from zip(*parts, strict=True)
 
-    def _descend(self, loss: Tensor, part: int) -> None:
-        """One step of the actor (part 0) or the critic (part 1)."""
-        self._adams[part].zero_grad(set_to_none=True)
+    def _descend(self, loss: Tensor, adam: torch.optim.Adam) -> None:
+        """One step of the parameters of `adam`, with a limited gradient."""
+        adam.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_((self._actor, self._critic)[part], self.settings.max_gradient)
-        self._adams[part].step()
+        nn.utils.clip_grad_norm_(adam.param_groups[0]["params"], self.settings.max_gradient)
+        adam.step()
 
     def weights(self) -> dict[str, Array]:
         """The arrays of the actor as in an actor's file."""
@@ -337,4 +339,5 @@ class Ppo:
     def _parameters(self) -> Iterator[tuple[str, nn.Parameter, dict[str, Any]]]:
         """The name, the values and Adam's moments of each parameter."""
         for name, parameter in self.policy.named_parameters():
-            yield name, parameter, self._adams[name.startswith("critic.")].state[parameter]
+            adam = self._critic_adam if name.startswith("critic.") else self._actor_adam
+            yield name, parameter, adam.state[parameter]

@@ -229,7 +229,8 @@ def test_the_rates_fall_linearly() -> None:
     states = RNG.normal(size=(8, 7)).astype(np.float32)
     step = step_of(states, RNG.normal(size=8), np.zeros(8, np.bool_))
     ppo.learn(states, RNG.normal(size=8).astype(np.float32), step, RNG, 0.25)
-    assert [adam.param_groups[0]["lr"] for adam in ppo._adams] == [2.5e-4, 1e-3]
+    adams = ppo._actor_adam, ppo._critic_adam
+    assert [adam.param_groups[0]["lr"] for adam in adams] == [2.5e-4, 1e-3]
 
 
 def test_the_history_has_the_last_eight_states() -> None:
