@@ -3,10 +3,15 @@
 `from mtlnet import load` gives the Python interface (`mtlnet.api`).
 """
 
-from typing import TYPE_CHECKING, Any
+import sys
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from mtlnet.api import Features, Model, load
+
+# OpenVINO and NNCF send usage statistics to their makers with this package, from a fork of the
+# process that converts a model. Without it, which both allow, they send nothing.
+sys.modules.setdefault("openvino_telemetry", cast(Any, None))
 
 __all__ = ["Features", "Model", "load"]
 

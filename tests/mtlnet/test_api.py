@@ -1,6 +1,7 @@
 """`from mtlnet import load`: the answers of the commands, from Python."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -176,3 +177,28 @@ def test_evaluation_and_export_are_those_of_the_commands(
     result = model.export("onnx", data=dataset, out=tmp_path / "onnx", frames=4)
     assert (tmp_path / "onnx" / "model.onnx").is_file()
     assert result["check"]["frames"] == 4
+
+
+CONVERT = """
+import os, sys
+from pathlib import Path
+forks = []
+sys.addaudithook(lambda event, _: forks.append(event) if event == "os.fork" else None)
+from mtlnet.model.network import Network
+from mtlnet.model.openvino_graph import write_graph
+write_graph(Network(), Path("model.xml"), Path("model.bin"))
+import nncf
+assert not forks, forks
+"""
+
+
+def test_converting_a_model_starts_no_process_and_leaves_nothing_in_the_home(
+    tmp_path: Path,
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    command = [sys.executable, "-c", CONVERT]
+    environment = os.environ | {"HOME": str(home)}
+    environment.pop("CI", None)
+    subprocess.run(command, env=environment, cwd=tmp_path, check=True, timeout=120)
+    assert not (home / "intel").exists()  # where OpenVINO's usage statistics keep their user's id
