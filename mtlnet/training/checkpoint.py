@@ -1,8 +1,9 @@
-"""Checkpoints of a run in training: one safetensors file each, written atomically.
+"""Saves and restores the state of a training run. A checkpoint is one safetensors file, written
+atomically.
 
-Tensors: `network.*`, `optimiser.OPTIMIZER.PARAMETER.NAME`, `balance.NAME` (task weighting) and
-`rng` (torch's CPU generator of the first process, for dropout). Metadata: the step and the seconds
-trained so far.
+Its tensors are `network.NAME`, `optimiser.OPTIMIZER.PARAMETER.NAME` (two indices and a name),
+`balance.NAME` (state of the task weighting) and `rng` (state of torch's CPU generator in the first
+process, for dropout). Its metadata are `step` and `elapsed_s`, the seconds trained so far.
 """
 
 from pathlib import Path
@@ -22,7 +23,10 @@ MAX_CHECKPOINTS = 2
 
 
 def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
-    """Write the state of `trainer` to `run`, and delete all but the latest `MAX_CHECKPOINTS`."""
+    """Write a checkpoint of `trainer` into the folder `run`, and return its path.
+
+    Deletes all but the newest `MAX_CHECKPOINTS`. `elapsed_s`: seconds trained so far.
+    """
     folder = run / FOLDER
     folder.mkdir(exist_ok=True)
     path = folder / f"step-{trainer.step_number:08d}.safetensors"
@@ -34,9 +38,9 @@ def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
 
 
 def load_checkpoint(path: Path, trainer: Trainer) -> float:
-    """Restore `trainer` from `path`; returns the seconds trained so far.
+    """Restore `trainer` from the checkpoint `path`; returns the seconds trained before it.
 
-    Raises ModelError when the file is damaged or of another network.
+    Raises ModelError when the file is damaged or belongs to another network.
     """
     try:
         with utf8_path(path) as plain, safe_open(plain, framework="pt") as file:
@@ -82,7 +86,7 @@ def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
 
 
 def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors whose names begin with `prefix`, by the rest of their names."""
+    """The tensors whose names begin with `prefix`, which is removed from the names."""
     return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
 
 

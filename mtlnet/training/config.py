@@ -21,7 +21,7 @@ MAX_THREADS = 1024
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run. Raises UserError for values that are not possible."""
+    """The options of one training run. Raises UserError for a value that is not allowed."""
 
     data: Annotated[
         Path,
@@ -74,7 +74,7 @@ class TrainConfig:
     minutes: Annotated[
         float | None,
         Option(
-            help="Duration of the training, min; the learning rate follows the elapsed time.",
+            help="Duration of the training in minutes; the learning rate follows the elapsed time.",
             show_default="no limit",
         ),
     ] = None
@@ -88,8 +88,9 @@ class TrainConfig:
     seed: Annotated[int, Option(help="Seed of all random numbers.")] = 0
     batch: Annotated[int, Option(help="Images per step.", show_default="the recipe's")] = 0
     rate_factor: float = 1.0
-    """Factor of the recipe's learning rate: `recipes.learning_rate_factor` for a run started on a
-    GPU. It is stored, so that a run keeps its rate on any device."""
+    """Factor by which the recipe's learning rate is multiplied: for a run started on a GPU, the
+    result of `recipes.learning_rate_factor`. It is stored, so that a resumed run keeps its rate on
+    any device."""
     device: Annotated[
         str, Option(help="Device: auto (a GPU if there is one), cpu, cuda or cuda:NUMBER.")
     ] = "auto"

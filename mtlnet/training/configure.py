@@ -1,4 +1,4 @@
-"""The configuration of a new run from its options, or of a stored run from its `config.json`."""
+"""Makes the configuration of a new run from its options, and writes and reads `config.json`."""
 
 import json
 import time
@@ -28,13 +28,16 @@ from trackfeatures.errors import UserError
 
 DATASET = Path("datasets/default")
 RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
-"""Fields that may change when a run is resumed; a change of any other field makes it another
-run."""
+"""Fields of TrainConfig that may change when a run is resumed; a change of any other field is
+refused."""
 
 
 def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
-    """The configuration of a new run; defaults come from the recipe, the network or the `init`
-    model."""
+    """The configuration of a new run from the `options` given on the command line.
+
+    Defaults come from the recipe, the network or the `init` model. `out`: folder of the run; None
+    for `runs/DATE-RECIPE`. Raises UserError for options that contradict each other.
+    """
     if out is None and read_rank().world_size > 1:
         raise UserError("give --out: several processes must use the same folder for the run")
     values: dict[str, Any] = {"data": DATASET, "recipe": "fast"}
@@ -56,7 +59,7 @@ def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
 
 
 def _for_gpu(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Batch size and factor of the learning rate for a new run on a GPU; empty for a CPU."""
+    """The fields `batch` and `rate_factor` of a new run on a GPU; an empty dict on a CPU."""
     if choose_device(values.get("device", "auto"), read_rank()).type != "cuda":
         return {}
     recipe = find_recipe(values["recipe"])
@@ -65,8 +68,10 @@ def _for_gpu(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
-    """Folder and card of the model to start from. Raises ModelError when it is missing or
-    damaged."""
+    """Folder and card of the model `name` (a run or a shipped model) from which a run starts.
+
+    Raises ModelError when the model is missing or damaged.
+    """
     run = resolve_run(name)
     card = read_card(run)
     check_files(run, card, (WEIGHTS,))
@@ -74,7 +79,7 @@ def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
 
 
 def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
-    """Write the `config.json` of a run."""
+    """Write `config.json` into the run's folder; `data` is the description of its dataset."""
     values = {**asdict(config), "data": str(config.data), "out": str(config.out)}
     content = {
         "definitions": tf.VERSION,
@@ -89,7 +94,10 @@ def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -
 
 
 def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """The configuration of a run and the description of its data. Raises ModelError."""
+    """The configuration in the folder `run` and the description of its data.
+
+    Raises ModelError when `config.json` is missing or damaged.
+    """
     path = run / CONFIG
     if not path.is_file():
         raise ModelError(
@@ -106,9 +114,10 @@ def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
 
 
 def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
-    """The stored configuration of a run, changed by the fields `given` on the command line.
+    """The stored configuration of a run, changed by the fields `given` on the command line, and
+    the description of its data.
 
-    Raises UserError when a given field would make it a different run.
+    Raises UserError when `given` changes a field that is not in `RESUMABLE_WITH`.
     """
     stored, data = read_config(run)
     given = dict(given)

@@ -1,9 +1,11 @@
-"""A training step recorded as a CUDA graph and replayed: one launch instead of hundreds.
+"""Records a training step as a CUDA graph and replays it, which takes one launch instead of
+hundreds.
 
-A replay uses the memory of the recording: each batch is copied into the memory of the first batch,
-and values that change at every step, such as the learning rate, are tensors on the device. Values
-that seldom change, such as the frozen layers, are constants of the recording. When a constant
-changes, the step is recorded again: twice in a run of recipe `fast`.
+A replay uses the memory of the recording. Therefore each batch is copied into the memory of the
+first batch, and values that change at every step, such as the learning rate, are tensors on the
+device. Values that seldom change, such as the number of frozen layers, are constants of the
+recording. When a constant changes, the step is recorded again; in a run of recipe `fast` this
+happens twice.
 """
 
 from collections.abc import Callable
@@ -23,7 +25,7 @@ Work = Callable[[], Losses]
 
 
 class Recorder(Protocol):
-    """Runs a step, or records it."""
+    """Interface that runs a training step or records it."""
 
     def run(self, work: Work) -> Losses:
         """Run `work` now, on the stream on which it will be recorded."""
@@ -67,12 +69,14 @@ class CudaGraphStep:
         self._batch: DeviceBatch | None = None
         self._warm_up_left = WARM_UP
         self._constants: object = None
-        """The constants of the recording, or of the steps before it."""
+        """The argument `constants` of the last call."""
         self._replay: Work | None = None
 
     def __call__(self, batch: DeviceBatch, constants: object) -> Losses:
-        """The losses of `work(batch)`. `constants`: the Python values that `work` depends on,
-        compared by ==."""
+        """Run `work` on `batch`, directly or as a replay, and return its losses.
+
+        `constants`: Python values on which `work` depends; a change (by ==) causes a new recording.
+        """
         static = self._copy_in(batch)
         if constants != self._constants:
             self._replay = None  # frees the old graph's memory before the next recording
@@ -87,7 +91,7 @@ class CudaGraphStep:
         return Losses(*(getattr(losses, f.name).detach().clone() for f in fields(Losses)))
 
     def _copy_in(self, batch: DeviceBatch) -> DeviceBatch:
-        """Copy the batch into the memory of the first batch."""
+        """Copy `batch` into the memory of the first batch, and return this copy."""
         if self._batch is None:
             self._batch = DeviceBatch(
                 *(getattr(batch, f.name).clone() for f in fields(DeviceBatch))

@@ -1,4 +1,4 @@
-"""The device of a training, and the settings of the CPU for it."""
+"""Selects the device of a training run and configures the CPU for it."""
 
 import ctypes
 import os
@@ -15,7 +15,11 @@ from trackfeatures.errors import UserError
 
 
 def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
-    """The device called `name`; "auto": a GPU if there is one, else the CPU. Raises UserError."""
+    """The torch device called `name`; "auto" selects a GPU if there is one, else the CPU.
+
+    With several processes on a machine, "cuda" selects the GPU numbered by the process's local
+    index. Raises UserError when the name is unknown or the device is missing.
+    """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and rank.local_world_size > 1:
@@ -31,7 +35,10 @@ def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
 
 
 def configure_cpu(threads: int, rank: Rank) -> None:
-    """Set the number of threads (0: an equal share of the cores) and keep freed memory."""
+    """Set torch's number of threads and make glibc keep freed memory.
+
+    `threads` 0: the cores of the machine are divided equally among its processes.
+    """
     torch.set_num_threads(threads or max((os.cpu_count() or 1) // rank.local_world_size, 1))
     cv2.setNumThreads(1)  # the images are small: a second thread pool would compete with torch's
     keep_freed_memory()
@@ -41,8 +48,9 @@ def configure_cpu(threads: int, rank: Rank) -> None:
 def subnormals_as_zero() -> Iterator[None]:
     """Within the context, treat numbers below 1e-38 as 0 in this thread and the threads it starts.
 
-    Units that seldom learn have momenta of this size after a few thousand steps. Each of these
-    numbers costs the CPU about 100 cycles. Without this setting a step took 1.9 times as long.
+    Weights that seldom get a gradient have momenta of this size after a few thousand steps. An
+    operation on one of these numbers costs the CPU about 100 cycles. Without this setting a
+    training step took 1.9 times as long.
     """
     torch.set_flush_denormal(True)
     try:
@@ -52,7 +60,7 @@ def subnormals_as_zero() -> Iterator[None]:
 
 
 def keep_freed_memory() -> None:
-    """Make glibc keep the memory of freed tensors, which shortens a step by a sixth.
+    """Make glibc keep the memory of freed tensors, which shortens a training step by a sixth.
 
     By default glibc returns the memory to the kernel, and each step causes 30,000 page faults.
     """

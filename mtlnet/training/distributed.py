@@ -1,4 +1,4 @@
-"""Several processes that train one network: `torchrun --nproc-per-node N -m mtlnet train ...`.
+"""Lets several processes train one network: `torchrun --nproc-per-node N -m mtlnet train ...`.
 
 Each process computes its part of every batch. Gradients, losses and the statistics of batch
 normalisation are averaged, so that N processes take the same steps as one. Only the first process
@@ -23,7 +23,8 @@ TIMEOUT = timedelta(minutes=30)  # all other processes wait while the first publ
 
 @dataclass(frozen=True)
 class Rank:
-    """Index of this process and number of processes, in total and on this machine."""
+    """Index of this process and number of processes: among all machines, and on this machine
+    (`local_`)."""
 
     index: int = 0
     world_size: int = 1
@@ -40,7 +41,10 @@ SINGLE_PROCESS = Rank()
 
 
 def read_rank() -> Rank:
-    """Rank of this process from the environment set by torchrun; without it, a single process."""
+    """The rank of this process, read from the environment variables that torchrun sets.
+
+    Without these variables it is `SINGLE_PROCESS`.
+    """
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     values = [os.environ.get(name) for name in names]
     if None in values:
@@ -50,7 +54,10 @@ def read_rank() -> Rank:
 
 @contextmanager
 def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None]:
-    """Connect the processes. Raises UserError when the batch cannot be divided among them."""
+    """Connect the processes for the duration of the context.
+
+    Raises UserError when `batch`, the images per step, cannot be divided among them.
+    """
     if rank.world_size == 1:
         yield
         return
@@ -69,7 +76,7 @@ def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None
 def dropout_seed(seed: int, rank: int, step: int = 0) -> int:
     """Seed of torch's generators in process `rank`, for a run that starts or resumes at `step`.
 
-    The seed differs between processes, which would otherwise draw the same dropout masks for
+    The seed differs between processes, because equal seeds would give the same dropout masks to
     different images. The first process of a new run uses `seed` itself.
     """
     if rank == step == 0:
@@ -78,7 +85,7 @@ def dropout_seed(seed: int, rank: int, step: int = 0) -> int:
 
 
 def average(tensors: Sequence[Tensor]) -> None:
-    """Replace tensors by their means over all processes, in one all-reduce."""
+    """Replace the values of each tensor by their means over all processes, in one all-reduce."""
     if not dist.is_initialized():
         return
     flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -91,7 +98,7 @@ def average(tensors: Sequence[Tensor]) -> None:
 
 
 def broadcast(values: Sequence[float], device: torch.device) -> list[float]:
-    """The first process's values, for decisions that all processes must share."""
+    """The `values` of the first process, so that all processes make the same decisions."""
     if not dist.is_initialized():
         return list(values)
     tensor = torch.tensor(values, dtype=torch.float64, device=device)

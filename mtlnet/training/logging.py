@@ -10,9 +10,10 @@ from runtime.tensorboard import TensorBoardWriter
 
 
 class CurveLog:
-    """Appends points to the curves of `run`; stored points after `step` are dropped first.
+    """Appends points to the loss curves in the folder `run`.
 
-    Points after `step` exist if the run was killed after its last checkpoint.
+    Stored points after `step` are deleted first. They exist if the run was killed after its last
+    checkpoint.
     """
 
     columns = COLUMNS

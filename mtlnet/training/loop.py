@@ -1,4 +1,4 @@
-"""The training loop: takes steps until the iterations or minutes are used up; saves checkpoints."""
+"""Takes training steps until the iterations or minutes are used up, and saves checkpoints."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +24,7 @@ from trackfeatures.errors import UserError
 LOG_EVERY = 10
 """Number of steps between two points of the curves."""
 CHECKPOINT_SECONDS = 60.0
+"""Time between two checkpoints, s."""
 STOPPING = (SIGINT, SIGTERM)
 """Signals that stop a training between two steps."""
 DIVERGED = (
@@ -34,7 +35,8 @@ DIVERGED = (
 
 @dataclass(frozen=True)
 class TrainProgress:
-    """Progress of a run: `fraction` done in [0, 1]; `losses` (distance, angle, class, total)."""
+    """Progress of a run: `fraction` in [0, 1] is done. `losses` (4,): distance, angle, class and
+    total, means over the last `LOG_EVERY` steps."""
 
     step: int
     fraction: float
@@ -44,7 +46,7 @@ class TrainProgress:
 
 
 class Stopped(KeyboardInterrupt):
-    """The user stopped the run; the argument is the path of the checkpoint."""
+    """Raised when the user stops the run; the argument is the path of the checkpoint."""
 
 
 Report = Callable[[TrainProgress], None]
@@ -59,8 +61,8 @@ def train_loop(
 ) -> None:
     """Train until the iterations or the minutes are used up, and save checkpoints.
 
-    `elapsed_s`: seconds trained before this call. Raises Stopped after Ctrl-C, UserError when the
-    training diverges.
+    `elapsed_s`: seconds trained before this call. `report` is called every `LOG_EVERY` steps.
+    Raises Stopped after Ctrl-C, UserError when the training diverges.
     """
     log = CurveLog(config.out, trainer.step_number) if trainer.rank.is_first else None
     begin = time.perf_counter() - elapsed_s
@@ -82,7 +84,7 @@ def train_loop(
                 break
             losses = trainer.step(next(batches), fraction)
             window.append(losses.row())
-            if trainer.device.type == "cpu":  # on a GPU this would wait for the step
+            if trainer.device.type == "cpu":  # on a GPU this check would wait for the step's end
                 require_finite(window[-1:], trainer.step_number)
             if trainer.step_number % LOG_EVERY == 0:
                 now = time.perf_counter()
@@ -110,7 +112,7 @@ def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
 
 
 def fraction_done(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
-    """Fraction of the run that is done: by steps or by time, whichever is larger."""
+    """Fraction of the run that is done, the larger of the fractions of its steps and its time."""
     recipe_steps = None if config.minutes is not None else trainer.recipe.iterations
     steps = config.iterations or recipe_steps
     by_steps = trainer.step_number / steps if steps else 0.0
@@ -119,7 +121,7 @@ def fraction_done(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> fl
 
 
 def curve_point(progress: TrainProgress, trainer: Trainer) -> dict[str, float]:
-    """A point of the curves, by column."""
+    """One row of `curves.csv`, as a dict from the name of a column to its value."""
     values = (
         progress.step,
         progress.elapsed_s,
@@ -132,9 +134,9 @@ def curve_point(progress: TrainProgress, trainer: Trainer) -> dict[str, float]:
 
 
 def require_finite(window: Sequence[torch.Tensor], step: int) -> None:
-    """Raise UserError when one of the last losses (4,) is not finite.
+    """Raise UserError when a loss is not finite.
 
-    `step`: the number of the last step.
+    `window`: the losses (4,) of each of the last steps, up to the step numbered `step`.
     """
     for steps_before, losses in enumerate(reversed(window)):
         if not bool(losses.isfinite().all()):

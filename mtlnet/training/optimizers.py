@@ -1,9 +1,10 @@
 """Optimizers: SGD, AdamW, or Muon for the large layers with AdamW for all other layers.
 
-Muon (Jordan et al. 2024) steps along the gradient with its singular values made equal; with it,
-recipe `fast` needed half the images in short trials. It trains the layers whose matrix is cheap to
-process: the convolutions, the first shared layer and small shared layers. AdamW trains heads,
-biases, wide shared layers, and torchvision's backbones, whose matrices have few rows.
+Muon (Jordan et al. 2024) makes the singular values of a layer's gradient equal and steps along the
+result. In short trials recipe `fast` needed half as many images with Muon. Muon trains the layers
+whose matrix is cheap to process: the convolutions, the first shared layer and small shared layers.
+AdamW trains heads, biases, wide shared layers, and torchvision's backbones, whose matrices have few
+rows.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,21 +18,24 @@ from mtlnet.model.network import Network
 from mtlnet.training.recipes import MOMENTUM, Recipe
 
 MUON_LAYERS = ("features.", "shared.fc0.")
+"""Prefixes of the names of the convolutions and of the first shared layer."""
 MUON_MAX_SIDE = 1024
-"""Maximum of the shorter side of a layer's matrix. The cost of a step grows with the square of this
-side: with the side of 4096 in network `deepdriving` a step takes twenty seconds on two cores."""
+"""Maximum of the shorter side of these layers' matrices; AdamW trains larger ones. The cost of a
+step grows with the square of this side: a matrix of network `deepdriving` has a shorter side of
+4096, and Muon's step then takes twenty seconds on two cores."""
 MUON_MAX_SHARED_SIDE = 512
 """Maximum of the longer side of the matrix of a shared layer other than the first."""
 MUON_LR_SCALE = 8.0
-"""Ratio of Muon's learning rate to the recipe's. Muon's updates are scaled to the size of AdamW's,
-and it tolerates longer steps."""
+"""Ratio of Muon's learning rate to the recipe's. It is above 1, because Muon's updates are scaled
+to the size of AdamW's, and Muon tolerates longer steps than AdamW."""
 
 
 class OptimizerSet:
-    """The optimizers of a network, stepped together. `extra`: parameters without weight decay.
+    """The one or two optimizers of a network, which step together.
 
-    `capturable`: a step can be recorded as a CUDA graph. Learning rates are then tensors on the
-    weights' device, and Muon processes layers of one size together.
+    `extra`: further parameters, trained without weight decay. `capturable`: a step can be recorded
+    as a CUDA graph. Learning rates are then tensors on the weights' device, and Muon processes
+    layers of one size together.
     """
 
     def __init__(
@@ -44,7 +48,7 @@ class OptimizerSet:
     ) -> None:
         self.optimizers: list[Optimizer] = []
         self.learning_rate = recipe.learning_rate
-        """The current learning rate of the recipe."""
+        """The recipe's learning rate at the current step, without `MUON_LR_SCALE`."""
         self.parameters = [*network.parameters(), *extra]
         self._matrices: list[tuple[nn.Parameter, nn.Parameter]] = []
         if recipe.optimizer == "sgd":
@@ -81,7 +85,7 @@ class OptimizerSet:
                 group["lr"] = torch.tensor(group["lr"], dtype=torch.float32, device=device)
 
     def gradients(self) -> list[Tensor]:
-        """The existing gradients, to be averaged over processes."""
+        """The gradients of all parameters that have one; processes average them."""
         return [p.grad for p in self.parameters if p.grad is not None]
 
     def zero_grad(self) -> None:
@@ -90,7 +94,7 @@ class OptimizerSet:
             parameter.grad = None
 
     def set_learning_rate(self, rate: float) -> None:
-        """Set the recipe's learning rate; Muon's is `MUON_LR_SCALE` times as large."""
+        """Set the learning rate to `rate`; Muon's is `MUON_LR_SCALE` times as large."""
         self.learning_rate = rate
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
@@ -109,7 +113,7 @@ class OptimizerSet:
 
 
 def uses_muon(name: str, weight: Tensor) -> bool:
-    """Whether Muon trains a layer."""
+    """Whether Muon, not AdamW, trains the parameter `weight` called `name`."""
     sides = as_matrix(weight).shape
     if name.startswith("shared.") and max(sides) <= MUON_MAX_SHARED_SIDE:
         return True
@@ -133,11 +137,11 @@ def _groups(
     return groups
 
 
-# Muon with its iterations on the Gram matrix, in float32. A step follows the gradient with its
-# singular values made (nearly) equal by five Newton-Schulz iterations. torch's Muon iterates on the
-# whole matrix in bf16, which suits a GPU; on a CPU without bf16 the iterations take longer than the
-# rest of a training step. Each iteration multiplies by a polynomial of the Gram matrix, so it can
-# run on the small Gram matrix: the large matrix is read twice instead of ten times.
+# Muon that iterates on the Gram matrix, in float32. Five Newton-Schulz iterations make the singular
+# values of the gradient (nearly) equal. torch's Muon iterates on the whole matrix in bf16, which
+# suits a GPU; on a CPU without bf16 the iterations take longer than the rest of a training step.
+# Each iteration multiplies by a polynomial of the Gram matrix, so the iterations can run on the
+# small Gram matrix. The large matrix is then read twice instead of ten times.
 
 
 RMS_OF_ADAMW = 0.2
@@ -169,7 +173,7 @@ class GramMuon(Muon):
                 _move(weight, change, group["lr"], group["weight_decay"])
 
     def _direction(self, weight: Tensor, momentum: float) -> Tensor:
-        """The gradient (F, C) with Nesterov's momentum."""
+        """The gradient (F, C) of `weight` with Nesterov's momentum; updates the momentum."""
         assert weight.grad is not None
         state = self.state[weight]
         if "momentum_buffer" not in state:
@@ -181,7 +185,10 @@ class GramMuon(Muon):
 
 
 def _move(weight: Tensor, change: Tensor, rate: float | Tensor, decay: float) -> None:
-    """Move a weight (F, C) against `change`, at a learning rate that may be a tensor ()."""
+    """Decay `weight` (F, C) and subtract `change` (F, C) times the step length.
+
+    `rate`: the learning rate, a number or a tensor (). `decay`: the weight decay.
+    """
     length = rate * RMS_OF_ADAMW * max(weight.shape) ** 0.5
     weight.mul_(1 - rate * decay)
     if isinstance(length, Tensor):
@@ -196,15 +203,16 @@ Coefficients = tuple[float, float, float]
 def orthogonalize_each(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> Iterator[Tensor]:
-    """Yields `orthogonalize` of each matrix; computes one at a time, to hold only one in memory."""
+    """Yields each matrix (F, C) with its singular values brought near 1, one matrix at a time to
+    save memory. The arguments are explained in `orthogonalize`."""
     return (orthogonalize(matrix, coefficients, steps, min_norm) for matrix in matrices)
 
 
 def orthogonalize_together(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> list[Tensor]:
-    """`orthogonalize` of each matrix; Gram matrices (F, F) of one size are processed as one batch
-    (N, F, F)."""
+    """All matrices (F, C) with their singular values brought near 1; Gram matrices (F, F) of one
+    size are processed as one batch (N, F, F). The arguments are explained in `orthogonalize`."""
     all_of = list(matrices)
     wide = [_wide(matrix, min_norm) for matrix in all_of]
     of_size: dict[int, list[int]] = {}
@@ -221,17 +229,19 @@ def orthogonalize_together(
 def orthogonalize(
     matrix: Tensor, coefficients: Coefficients, steps: int, min_norm: float
 ) -> Tensor:
-    """`matrix` (F, C) with its singular values brought near 1; its norm counts as at least
-    `min_norm`.
+    """`matrix` (F, C) with its singular values brought near 1.
 
-    Newton-Schulz iterations with a quintic polynomial (Jordan et al. 2024).
+    Takes `steps` Newton-Schulz iterations with the quintic polynomial of the three `coefficients`
+    (Jordan et al. 2024). The matrix is first divided by its norm, or by `min_norm` if that is
+    larger.
     """
     wide = _wide(matrix, min_norm)
     return _as_before(gram_polynomial(wide @ wide.T, coefficients, steps) @ wide, matrix)
 
 
 def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Tensor:
-    """Polynomial of Gram matrices (F, F) or (N, F, F) by which the iterations multiply."""
+    """The matrix by which `steps` Newton-Schulz iterations multiply a matrix with the Gram matrix
+    `gram`: a polynomial of `gram`. Both have the shape (F, F), or (N, F, F) for N matrices."""
     first, second, third = coefficients
     add_product = torch.addmm if gram.ndim == 2 else torch.baddbmm
     product: Tensor | None = None
@@ -247,11 +257,13 @@ def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Ten
 
 
 def _wide(matrix: Tensor, min_norm: float) -> Tensor:
-    """The matrix, transposed if needed so that its shorter side comes first, with norm 1."""
+    """The matrix divided by its norm (at least `min_norm`), transposed if needed so that its
+    shorter side comes first."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
     unit: Tensor = wide / wide.norm().clamp(min=min_norm)
     return unit
 
 
 def _as_before(wide: Tensor, matrix: Tensor) -> Tensor:
+    """`wide`, transposed if needed to the shape of `matrix`."""
     return wide if matrix.shape[0] <= matrix.shape[1] else wide.T

@@ -11,24 +11,27 @@ times faster. The shared layers are not normalised: batch statistics add noise t
 The statistics are frozen in the last part of a run: the last convolutions have only some hundred
 positions per batch, and the network is then trained in the form in which it is used.
 - The first two convolutions are frozen after a part of the run (FreezeOut, Brock et al. 2017): they
-converge early and take nearly nine tenths of a backward pass. The time saved gives more steps.
-- The heads predict in standard deviations of each target, and the loss is in the same units: the
-coded angle varies by 0.03 and a coded distance by 0.2, so the angle would hardly be learned.
+converge early and take nearly nine tenths of a backward pass. The time saved is used for more
+steps.
+- The unit of each output and of its loss is the standard deviation of the target. In coded units
+the angle would hardly be learned, because its standard deviation is only 0.03, against 0.2 for a
+distance.
 - Muon for the large layers (`mtlnet.training.optimizers`): in short trials it needed half as many
-images for the same errors. The learning rate warms up, then falls to zero along a cosine. At twice
-the rate the distance errors are larger by 2 to 28 % after 5 minutes on one core and by 9 to 43 %
-after 17. A batch has 64 images, because Muon's own cost does not depend on the size of the batch.
-- Huber losses with gains (`HuberLoss`): `l`, `m` and `r` jump where they become inactive, and a
-squared error favours a value in between.
+images for the same errors. The learning rate warms up, then falls to zero along a cosine. With
+twice this learning rate the distance errors are larger by 2 to 28 % after 5 minutes on one core and
+by 9 to 43 % after 17 minutes. A batch has 64 images instead of 32, because Muon's own cost does not
+depend on the size of the batch.
+- Huber losses with gains (`HuberLoss`) replace squared errors: `l`, `m` and `r` jump where they
+become absent, and a squared error favours a value in between.
 - No dropout: it adds noise to outputs that must be accurate to a few per cent.
 - Images are mirrored, rotated, partly covered and changed in brightness, contrast and tint, with
-their labels (`mtlnet.data.augment.pipeline`): rounds are few, and a network overfits their
-scenery.
+their labels (`mtlnet.data.augment.pipeline`), because a dataset has few rounds and a network
+overfits their scenery.
 
 `continue`: `fast` starting from a finished model (`--init`), for hours on new frames. Batch
 normalisation is restored first, and the network may get more residual convolutions
 (`mtlnet.model.pretrained`). The first convolution stays frozen. Frames in sharp bends and near a
-change of class, where most errors occur, are drawn twice as often. In a pilot of 5 minutes this
+change of class, where most errors occur, appear twice in an epoch. In a pilot of 5 minutes this
 reduced the number of wrong classes to 0.89 and the angle's error to 0.97 of their former values.
 With a learning rate of 1e-3 the model lost more of its former training than it gained by the new
 frames. The learning rate is constant until the last fifth of the run, then
@@ -80,12 +83,14 @@ class Recipe:
     """Optimizer: sgd, adamw or muon (which uses AdamW for small layers)."""
     learning_rate: float
     batch: int
+    """Images per step on a CPU."""
     iterations: int
     dropout: float
     l2: float
     """Weight of the L2 term |w|^2 (sgd), or decoupled weight decay (adamw, muon)."""
     batch_norm: bool
     standardise: bool
+    """Whether the unit of each output and loss is the standard deviation of the target."""
     augment: bool
     freeze_bn_at: float = 1.0
     """Share of the run after which the statistics of batch normalisation are frozen."""
@@ -95,11 +100,12 @@ class Recipe:
     """Pairs (share, count): after this share of the run the first `count` convolutions are
     frozen."""
     hard_repeats: int = 1
-    """Number of times that each of `mtlnet.data.road_ahead.hard_frames` is drawn in an epoch."""
+    """Number of times that a hard frame (`mtlnet.data.road_ahead.hard_frames`) is used in an
+    epoch."""
     from_model: bool = False
     """Whether the recipe starts from a finished model (`--init`)."""
     gpu_batch: int = 0
-    """Images per step on a GPU, because smaller batches leave a part of it idle; 0: as `batch`."""
+    """Images per step on a GPU, because small batches leave a part of it idle; 0: `batch`."""
     fall_from: float | None = None
     """Share of the run up to which the learning rate is constant after the warm-up (adamw, muon).
     None: the rate falls along a cosine after the warm-up."""

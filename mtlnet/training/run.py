@@ -1,8 +1,8 @@
-"""A training run: from its configuration to trained weights, in the folder of the run.
+"""Trains a network by a configuration, in the folder of the run.
 
-After Ctrl-C it leaves a checkpoint, from which `--resume` continues. With `--init` it starts from a
-finished model and keeps that model's camera. The caller passes the function that turns the trained
-network into a finished model (`mtlnet.train`).
+A run stopped with Ctrl-C leaves a checkpoint, from which `--resume` continues. A run with `--init`
+starts from a finished model and keeps that model's camera. The caller passes the function that
+turns the trained network into a finished model (`mtlnet.train`).
 """
 
 import shutil
@@ -40,8 +40,8 @@ from runtime.files import locked_folder, unfinished_path
 from trackfeatures.errors import UserError
 
 PRETRAINED_FRAMES = 128
-"""Number of frames on which the statistics of batch normalisation are measured for a finished
-model."""
+"""Number of training frames on which the batch statistics are measured when batch normalisation is
+restored in a finished model."""
 
 Finish = Callable[[TrainConfig, Trainer, TrainingData], None]
 """Writes the finished model to the run's folder; called in the first process only."""
@@ -58,8 +58,9 @@ def run_training(
     """Train by `config` in the folder `config.out`, then call `finish`.
 
     `resumed`: the stored description of the data of the run to resume; None starts a new run.
-    `checked`: all images are known to be decodable. Raises UserError (data, an existing folder,
-    memory, disk, a run that is being trained), Stopped after Ctrl-C.
+    `checked`: the caller has decoded all images without an error. Raises UserError for unusable
+    data, an existing folder, a lack of memory or disk space, and a run that another process is
+    training; raises Stopped after Ctrl-C.
     """
     find_recipe(config.recipe)  # raises when there is none
     rank = read_rank()
@@ -130,8 +131,10 @@ def _train(
 
 
 def require_new(out: Path) -> None:
-    """Raise UserError when the folder of a new run exists; a killed start may have left it
-    empty."""
+    """Raise UserError when the folder of a new run exists and is not empty.
+
+    A start that was killed can have left the folder empty, or with an unfinished `config.json`.
+    """
     empty = out.is_dir() and {*out.iterdir()} <= {unfinished_path(out / CONFIG)}
     if out.exists() and not empty:
         raise UserError(
@@ -156,9 +159,10 @@ def prepare(
     device: torch.device,
     rank: Rank,
 ) -> tuple[Trainer, Loader]:
-    """The trainer before its first step, with the weights of the model `init`, and the batches.
+    """The trainer before its first step, and the loader of its batches.
 
-    `init` None: new weights, or weights that are then read from a checkpoint.
+    `init`: folder and card of the model whose weights the network gets. None: new weights, which
+    the caller may replace by the weights of a checkpoint.
     """
     recipe = find_recipe(config.recipe)
     recipe = replace(recipe, learning_rate=recipe.learning_rate * config.rate_factor)
@@ -192,8 +196,10 @@ def prepare(
 
 
 def road_ahead(data: TrainingData, device: torch.device) -> RoadAhead | None:
-    """Labels of the road ahead if the data are recorded rounds, else None; read in advance for a
-    GPU."""
+    """The labels of the road ahead for recorded rounds; None for a user's own pictures.
+
+    For training on a GPU the labels of all frames are read in advance.
+    """
     if not isinstance(data.frames, Frames):
         return None
     return RoadAhead(data.frames, data.camera, keep=device.type != "cpu")

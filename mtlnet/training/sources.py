@@ -1,4 +1,4 @@
-"""Training data of a run: the train rounds of a dataset, or a user's own labelled pictures."""
+"""Opens the training data of a run: the train rounds of a dataset, or a user's own pictures."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,17 +30,18 @@ from trackfeatures.errors import UserError
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The frames of a run, all of one camera."""
+    """The frames on which a run trains, all of one camera."""
 
     frames: Frames | CustomImages
     held_out: Frames | None
-    """Rounds for fitting the uncertainty head; None if there are too few."""
+    """Frames of the rounds on which the uncertainty head is fitted; None if there are too few
+    rounds."""
     camera: CameraParameters
     about: dict[str, Any]
     """Description of the data: the `data` field of the model card."""
 
     def spread_images(self, count: int) -> NDArray[np.uint8]:
-        """At most `count` images (B, 210, 280, 3), evenly spaced over the frames."""
+        """At most `count` RGB images (B, 210, 280, 3) uint8, evenly spaced over the frames."""
         count = min(count, len(self.frames))
         rows = np.linspace(0, len(self.frames) - 1, count).astype(np.int64)
         return self.frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
@@ -49,12 +50,11 @@ class TrainingData:
 def open_training_data(
     config: TrainConfig, init: ModelCard | None, *, checked: bool = False
 ) -> TrainingData:
-    """Open `config.data`: recorded rounds or a user's own pictures; `init`: the model to start
-    from.
+    """Open the folder `config.data` of recorded rounds or of a user's own pictures.
 
-    All images are decoded once, so that a damaged image ends the run at its start. `checked`: the
-    images have been decoded before. Raises UserError for data that does not fit the network or the
-    model.
+    `init`: card of the model to start from. All images are decoded once, so that a damaged image
+    ends the run at its start; `checked`: the images have been decoded before. Raises UserError for
+    data or a network that does not fit the model.
     """
     normalised = find_recipe(config.recipe).batch_norm
     if init is not None and normalised and find_architecture(init.network).backbone:
@@ -147,7 +147,8 @@ def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) 
 
 
 def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
-    """Data for training the model of `card` further; the model's own data is added to `about`."""
+    """`data`, for training the model of `card` further. Its description `about` gets the model's
+    name, and the data on which that model was trained."""
     about = {
         **_with_seen(data.about, card.data),
         "init": _origin(card),
@@ -162,7 +163,8 @@ def resume_data(
     earlier: dict[str, Any],
     start: ModelCard | None = None,
 ) -> TrainingData:
-    """The data of a resumed run. An earlier dataset of the run that differs is added to `about`.
+    """The data of a resumed run. If the run used another dataset before, its description is added
+    to `about`.
 
     `earlier`: the description of the run's data so far. `start`: the model whose weights the run
     needs again, because it has no checkpoint. Raises ModelError when `start` is another model than
@@ -181,23 +183,23 @@ def resume_data(
     if not history:
         return data
     about = {**_with_seen(data.about, earlier), "earlier": history}
-    if "init" in earlier:  # the model that this name meant when the run was started
+    if "init" in earlier:  # a model of this name can have changed since the run was started
         about["init"] = earlier["init"]
     return replace(data, about=about)
 
 
 def _origin(card: ModelCard) -> dict[str, Any]:
-    """The entry for the model that a run starts from, in a description of data."""
+    """The entry `init` of a description of data: name and hash of the model to start from."""
     return {"name": card.name, "model_hash": card.model_hash}
 
 
 def _summary(data: dict[str, Any]) -> dict[str, Any]:
-    """The entry for a dataset of an earlier training, in a model's card."""
+    """An entry of the list `earlier` in a description of data: one dataset used before."""
     return {name: data.get(name) for name in ("path", "content_hash", "frames")}
 
 
 def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
-    """The description `about` with the rounds and tracks of `earlier` added as seen."""
+    """The description `about` with the tracks, pictures and round seeds of `earlier` added."""
     names = [name for name in ("tracks", "pictures") if name in about or name in earlier]
     seen: dict[str, Any] = {
         name: sorted({*about.get(name, ()), *earlier.get(name, ())}) for name in names

@@ -1,4 +1,4 @@
-"""The trainer: a network, its optimizers and one training step."""
+"""Trains a network: a `Trainer` holds the network and its optimizers, and takes training steps."""
 
 from collections.abc import Sequence
 
@@ -24,12 +24,13 @@ from mtlnet.training.recipes import Recipe, frozen_convolutions, learning_rate
 from runtime.processor import has_bf16
 
 MIN_TARGET_STD = (0.01,) * 6
+"""Lower bounds (6,) of the standard deviations of the coded targets, the units of the heads."""
 FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
-"""Lower bounds of the heads' units (6,) in fine-tuning: standard deviations of the targets in
-varied driving, because a few images can be nearly identical."""
+"""The same bounds in fine-tuning, where a few images can be nearly identical: the standard
+deviations in varied driving."""
 MIN_STEPS_BEFORE_BN_FREEZE = 100
-"""Number of steps after which the running statistics of batch normalisation no longer depend on the
-initial weights."""
+"""Minimum number of steps before batch normalisation is frozen: earlier, its running statistics
+still depend on the initial weights."""
 
 
 class Trainer:
@@ -82,17 +83,16 @@ class Trainer:
         return CudaGraphStep(self.optimize, CudaRecorder(self.device))
 
     def seed_dropout(self) -> None:
-        """Seed torch's global generators, from which its dropout layers draw their masks.
-
-        torch's dropout layers do not accept a generator as an argument.
-        """
+        """Seed torch's global generators, because torch's dropout layers use them and do not accept
+        a generator as an argument."""
         if self.recipe.dropout:
             torch.manual_seed(dropout_seed(self.seed, self.rank.index, self.step_number))
 
     def standardise(self, loader: Loader, *, fine_tune: bool = False) -> None:
-        """Set the heads' units to the mean and standard deviation of the training targets.
+        """Set the heads' zero and unit to the mean and standard deviation of the training targets.
 
-        `fine_tune`: the training starts from a finished model, perhaps with few images.
+        `fine_tune`: the training starts from a finished model, perhaps with few images, so the
+        lower bounds are `FINE_TUNE_MIN_STD`. Does nothing unless the recipe standardises.
         """
         if not self.recipe.standardise:
             return
@@ -108,8 +108,10 @@ class Trainer:
         self.target_variance = (std**2).float().to(self.device)
 
     def step(self, batch: Batch | DeviceBatch, progress: float) -> Losses:
-        """Train on one batch at `progress` in [0, 1] of the run; returns the losses before the
-        step."""
+        """Train on one batch; returns its losses before the weights changed.
+
+        `progress`: fraction in [0, 1] of the run that is done.
+        """
         self.network.train()
         settled = self.step_number >= MIN_STEPS_BEFORE_BN_FREEZE
         frozen_norm = settled and progress >= self.recipe.freeze_bn_at
@@ -161,8 +163,8 @@ class Trainer:
         return outputs
 
     def scores(self, images: Tensor, ahead: Tensor) -> tuple[Scores, Tensor | None]:
-        """Scores for images uint8 (B, 210, 280, 3), and the auxiliary loss if there are labels for
-        it."""
+        """Scores of the network in training for images uint8 (B, 210, 280, 3), and the auxiliary
+        loss () for the labels `ahead` of the road ahead; None if there are no labels."""
         network, dtype = self.network, self._dtype()
         if self.device.type == "cpu" and network.architecture.features in FAST:
             grid = forward_grid(network, images, dtype)
@@ -207,11 +209,12 @@ def dropout_masks(
     seed: list[int],
     part: tuple[int, int] = (0, 1),
 ) -> list[Tensor]:
-    """Dropout masks (count, units), one for each layer of `units`, scaled by 1 / (1 - probability).
+    """Dropout masks (count, units), one for each number of units in `layers`, with the values 0 and
+    1 / (1 - probability). `count`: images of this process.
 
-    They are a function of the seed, so that a run can be resumed without the state of a generator.
-    `part` (index, count): this process's part; all parts together have the masks of a single
-    process.
+    The masks are a function of the seed, so that a run can be resumed without the state of a
+    generator. `part`: index of this process and number of processes, which together use the masks
+    that a single process would use.
     """
     if not probability:
         return []

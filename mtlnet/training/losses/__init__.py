@@ -1,1 +1,1 @@
-"""The losses of the tasks, and their weights."""
+"""The losses of the three tasks (distance, angle, class), and the weights of these losses."""

@@ -15,9 +15,9 @@ class AlphaError(UserError):
 
 
 def parse_alpha(text: str) -> Alpha:
-    """Three weights from "distance,angle,class": each 0 or more, of any sum; 0 leaves a task out.
+    """The weights of the three tasks, parsed from `text` of the form "distance,angle,class".
 
-    Raises AlphaError.
+    A weight is 0 or more, and 0 leaves a task out; the weights can have any sum. Raises AlphaError.
     """
     parts = [part.strip() for part in text.split(",")]
     how = "give three weights for distance, angle and heading, such as --alpha 0.3,0.2,0.5"

@@ -1,10 +1,11 @@
 """The loss of a network with heads over bins (`mtlnet.model.bins`).
 
-Distances: the cross-entropy of each target distribution, mean over the five distances and the
-batch. (Summed over the five, as the paper's squared errors are, it outweighed angle and class in a
-pilot of 300 steps.) Angle: the cross-entropy plus the Huber error of the distribution's mean, in
-bins, as Ruiz et al. 2018 do for head pose, because a softmax has no notion of neighbouring bins.
-Class: the cross-entropy. Alpha weights the three tasks as in the paper.
+The loss of the distances is the cross-entropy with the target distributions, mean over the five
+distances and the batch. (The paper sums its squared errors over the five; a sum of cross-entropies
+outweighed angle and class in a pilot of 300 steps.) The loss of the angle is the cross-entropy plus
+the Huber error of the distribution's mean, in bins, as in Ruiz et al. 2018 for head pose, because
+the cross-entropy alone does not depend on how far a wrong bin is from the right one. The loss of
+the class is the cross-entropy. Alpha weights the three tasks as in the paper.
 """
 
 from collections.abc import Callable
@@ -25,11 +26,11 @@ def bins_loss(
     total: Callable[[Terms], Tensor],
     auxiliary: Tensor | None = None,
 ) -> Losses:
-    """Losses of scores for targets coded (B, 6) and heading (B,); `auxiliary` is added to the
-    total.
+    """The losses of `scores` of B images for the targets `coded` (B, 6) and `heading` (B,).
 
-    The reported losses are squared errors of the coded answers, as for networks without bins. An
-    unknown label has no loss, as in `mtlnet.training.losses.multi_task`.
+    `total` computes the weighted sum of the tasks' terms; `auxiliary` () is added to this sum. The
+    reported losses are squared errors of the coded answers, as for networks without bins. An
+    unknown distance (NaN) or class (`UNKNOWN_HEADING`) adds no loss.
     """
     known, weight = known_targets(coded)
     distances, angles = bin_targets(torch.where(known, coded, OFFSET))

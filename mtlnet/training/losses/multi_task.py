@@ -2,8 +2,8 @@
 
 Distance: squared error, summed over the five coded distances, mean over the batch. Angle: squared
 error of the coded angle, mean over the batch. Class (the paper's "type"): cross-entropy of the
-class, mean over the batch. The L2 term is part of the optimizer: a weight decay of 2 lambda is the
-gradient of lambda |w|^2.
+class, mean over the batch. The optimizer adds the L2 term: the gradient of lambda |w|^2 is a weight
+decay of 2 lambda.
 
 An unknown label (a coded target of NaN, the class `UNKNOWN_HEADING`) has no loss: means are over
 the known labels.
@@ -25,9 +25,11 @@ Terms = Sequence[Tensor]
 
 @dataclass(frozen=True)
 class Losses:
-    """The unweighted loss of each task, as reported, and the weighted sum that training minimises.
+    """The losses of a batch, each a tensor () if no shape is given.
 
-    `terms` (3,): the term of each task in the weighted sum, before its weight.
+    `distance`, `angle`, `heading`: the losses of the tasks, in the units that are reported.
+    `total`: the weighted sum that training minimises. `terms` (3,): the tasks' terms of this sum
+    before their weights; their units can differ from the reported losses.
     """
 
     distance: Tensor
@@ -49,13 +51,13 @@ def multi_task_loss(
     target_variance: Tensor | None = None,
     huber: HuberLoss | None = None,
 ) -> Losses:
-    """Losses of outputs (B, 9) for targets coded (B, 6) and heading (B,) int64.
+    """The losses of `outputs` (B, 9) for the targets `coded` (B, 6) and `heading` (B,) int64.
 
     `total`: computes the sum that training minimises from the tasks' terms (`TaskWeighting.total`).
     `target_variance` (6,): variances of the coded targets. With it, the terms (not the reported
-    losses) are in units of these variances, and averaged over the distances: predicting the mean
-    then costs about 1 in every task, whatever its range. `huber`: with `target_variance`, Huber
-    losses instead of squares.
+    losses) are in units of these variances and averaged over the distances, so that a network that
+    predicts the mean has a loss of about 1 in every task. `huber`: replaces the squared errors by
+    Huber losses; it is used only with `target_variance`.
     """
     known, weight = known_targets(coded)
     errors = torch.where(known, outputs[:, :6].float() - coded, 0.0)
@@ -75,8 +77,8 @@ def multi_task_loss(
 
 
 def known_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
-    """Which coded targets (B, 6) are known, and the factor () that turns a mean over all distances
-    into a mean over the known ones; 1 if all are known."""
+    """The mask (B, 6) of the coded targets that are not NaN, and the factor () that turns a mean
+    over all distances into a mean over the known distances (1 if all are known)."""
     known = ~coded.isnan()
     each = known[:, :5]
     return known, each.numel() / each.sum().clamp_min(1)

@@ -1,7 +1,7 @@
 """Weights of the three tasks in the loss: `--balance fixed|uncertainty|dwa`.
 
-`fixed`: the weights of `--alpha`, as in the paper. The other methods set the weights themselves;
-alpha then only selects the tasks (0: not learned).
+`fixed` uses the weights of `--alpha`, as in the paper. The methods `uncertainty` and `dwa` set the
+weights themselves; alpha then only selects the tasks (0: the task is not learned).
 
 `uncertainty` (Kendall, Gal and Cipolla 2018, equation 7): the log variance s of each task is
 learned with the network; a squared error L contributes exp(-s) L / 2 + s / 2, a cross-entropy
@@ -10,7 +10,7 @@ exp(-s) L + s / 2.
 `dwa`, dynamic weight average (Liu, Johns and Davison 2019, equation 7): a task whose loss falls
 more slowly gets more weight, K exp(r / T) / sum(exp(r / T)). Here r is the mean loss term over the
 last window of steps divided by the mean over the window before it, K is the number of tasks, and
-T = 2. A window is an epoch, or `WINDOW_STEPS` if that is shorter.
+T = 2. A window has the steps of one epoch, but at most `WINDOW_STEPS`.
 """
 
 import torch
@@ -20,8 +20,8 @@ from mtlnet.training.losses.alpha import TASKS, Alpha, require_method
 from mtlnet.training.losses.multi_task import Terms
 
 LIKELIHOOD_FACTORS = (0.5, 0.5, 1.0)
-"""Factors of exp(-s) L: a normal distribution has half the squared error in its exponent, a
-cross-entropy no factor."""
+"""Factors of exp(-s) L for distance, angle and class. A normal distribution has half the squared
+error in its exponent; a cross-entropy is a log likelihood without a factor."""
 TEMPERATURE = 2.0
 WINDOW_STEPS = 500
 
@@ -35,7 +35,7 @@ class TaskWeighting:
         self.method = require_method(method)
         self.learned = torch.tensor([weight > 0 for weight in alpha], device=device)
         self._tasks = [number for number, weight in enumerate(alpha) if weight > 0]
-        # Not a mask: a CUDA graph cannot record a selection of unknown size.
+        # Indices, because a CUDA graph cannot record a selection by a mask: its size is unknown.
         self._chosen = torch.tensor(self._tasks, device=device)
         self._factors = torch.tensor(LIKELIHOOD_FACTORS, device=device)[self._chosen]
         self.window = max(min(steps_per_epoch, WINDOW_STEPS), 1)
@@ -45,7 +45,7 @@ class TaskWeighting:
         self.sums = torch.zeros(len(TASKS), dtype=torch.float64, device=device)
         self.previous_means = torch.zeros_like(self.sums)
         self.counts = torch.zeros(2, dtype=torch.int64)
-        """Number of steps in this window, number of completed windows."""
+        """(2,): number of steps in the current window, number of completed windows."""
 
     @property
     def parameters(self) -> list[nn.Parameter]:
@@ -66,7 +66,7 @@ class TaskWeighting:
 
     @torch.no_grad()
     def current_weights(self) -> list[float]:
-        """Factor of each task's term at this step."""
+        """The factor of each task's loss term at this step; 0 for a task that is not learned."""
         if self.method != "uncertainty":
             return [float(weight) for weight in self.weights]
         factors = torch.tensor(LIKELIHOOD_FACTORS)
@@ -75,7 +75,8 @@ class TaskWeighting:
 
     @torch.no_grad()
     def update(self, terms: Tensor) -> None:
-        """Add the terms (3,) of a step, averaged over the whole batch; used by `dwa`."""
+        """Add the loss terms (3,) of a step, averaged over the whole batch; a full window of steps
+        sets new weights. Does nothing unless the method is `dwa`."""
         if self.method != "dwa":
             return
         self.sums += terms
@@ -93,7 +94,7 @@ class TaskWeighting:
         self.counts = torch.tensor([0, int(self.counts[1]) + 1])
 
     def state(self) -> dict[str, Tensor]:
-        """The tensors of a checkpoint, by the names in the file."""
+        """The tensors to store in a checkpoint, by their names in the file."""
         return {
             "log_variance": self.log_variance.detach(),
             "current": self.weights,
@@ -104,6 +105,6 @@ class TaskWeighting:
 
     @torch.no_grad()
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore a `state`. Raises KeyError when a tensor is missing."""
+        """Restore the tensors that `state()` returned. Raises KeyError when one is missing."""
         for name, tensor in self.state().items():
             tensor.copy_(state[name])
