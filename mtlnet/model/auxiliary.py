@@ -1,11 +1,12 @@
 """Auxiliary heads and loss of a network with heads over bins, used only in training.
 
-Columns: where the markings of the car's lane cross the image rows `ROWS`, computed from the grid by
-a 1 x 1 convolution. For each marking and row it is a softmax over the columns of the grid; the
-label is split between two neighbouring columns. Curvature: the curvature of the road at `AHEAD_M`
-in front of the car, computed from the last shared features; for each distance it is a softmax over
-bins. The columns preserve small details of the image, the curvature shows where a bend begins.
-Labels: `mtlnet.data.road_ahead`; unknown labels do not count.
+The first head predicts the image columns in which the markings of the car's lane cross the image
+rows `ROWS`. It is a 1 x 1 convolution of the grid, with a softmax over the grid's columns for each
+marking and row; a label is split between two neighbouring columns. The second head predicts the
+curvature of the road at the distances `AHEAD_M` in front of the car from the last shared features,
+with a softmax over bins for each distance. The columns make the network keep small details of the
+image, and the curvature makes it see where a bend begins. `mtlnet.data.road_ahead` computes the
+labels; unknown labels add no loss.
 """
 
 import torch
@@ -15,20 +16,20 @@ from mtlnet.architecture import HEIGHT, WIDTH, Architecture, grid_size
 from mtlnet.model.bins import normal_targets, soft_cross_entropy
 
 ROWS = (112.0, 116.0, 121.0, 127.0, 134.0, 143.0, 154.0, 168.0, 186.0, 206.0)
-"""Rows, px; a level camera sees the road there at 25, 16, 11, 8.4, 6.4, 4.9, 3.8, 3.0, 2.3 and 1.9
-m."""
+"""Image rows, px, in which a level camera sees the road 25, 16, 11, 8.4, 6.4, 4.9, 3.8, 3.0, 2.3
+and 1.9 m ahead."""
 SIDES = 2  # left and right marking of the lane
 AHEAD_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0)
 LABELS = SIDES * len(ROWS) + len(AHEAD_M)
 COLUMNS_WEIGHT, CURVATURE_WEIGHT = 0.5, 0.1
-CURVATURES = 41
+CURVATURES = 41  # bins of a curvature
 SHARPEST = 0.32
-"""Limit of the bins, which are equal in the square root of the curvature (1/m): bends of 10 m
-radius."""
+"""Largest square root of a curvature in 1/m that the bins contain, the root for a bend of 10 m
+radius. The bins have equal widths in the root."""
 
 
 class AuxiliaryHeads(nn.Module):
-    """The auxiliary heads."""
+    """The heads of the columns and of the curvatures, for a network with `size` last features."""
 
     def __init__(self, plan: Architecture, size: int) -> None:
         super().__init__()
@@ -37,7 +38,7 @@ class AuxiliaryHeads(nn.Module):
         self.curvature = nn.Linear(size, len(AHEAD_M) * CURVATURES)
         place = (HEIGHT - plan.first_row) / height
         self.rows = [min(int((row - plan.first_row) / place), height - 1) for row in ROWS]
-        """Row of the grid for each of `ROWS`."""
+        """Index of the grid row that contains each image row of `ROWS`."""
 
     def forward(self, grid: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Scores of columns (B, 2, ROWS, w) and curvatures (B, AHEAD_M, CURVATURES), from a grid
@@ -51,8 +52,11 @@ class AuxiliaryHeads(nn.Module):
 
 
 def auxiliary_loss(scores: tuple[Tensor, Tensor], labels: Tensor) -> Tensor:
-    """Weighted sum of the cross-entropies of columns and curvatures for labels (B, LABELS): columns
-    in px, left marking first, then curvatures in 1/m; NaN where unknown."""
+    """Weighted sum () of the cross-entropies of columns and curvatures.
+
+    `scores`: the result of `AuxiliaryHeads`. `labels` (B, LABELS): image columns in px, those of
+    the left marking first, then curvatures in 1/m; NaN where unknown.
+    """
     columns, curvature = scores
     places = labels[:, : -len(AHEAD_M)].reshape(-1, SIDES, len(ROWS))
     bends = labels[:, -len(AHEAD_M) :]
@@ -65,13 +69,14 @@ def auxiliary_loss(scores: tuple[Tensor, Tensor], labels: Tensor) -> Tensor:
 
 
 def split_columns(places: Tensor, count: int) -> Tensor:
-    """Distributions (..., count) over the grid's columns for positions (...) in px, each split
-    between the two columns whose centres enclose it."""
+    """Distributions (..., count) over the grid's `count` columns for image columns `places` (...)
+    in px; each is split between the two grid columns whose centres enclose it."""
     at = (places.nan_to_num() * (count / WIDTH) - 0.5).clamp(0, count - 1)
     number = torch.arange(count, dtype=at.dtype, device=at.device)
     return (1 - (at[..., None] - number).abs()).clamp_min(0)
 
 
 def _known_mean(losses: Tensor, labels: Tensor) -> Tensor:
+    """Mean () of the losses whose labels, of the same shape, are not NaN."""
     known = ~labels.isnan()
     return (losses * known).sum() / known.sum().clamp_min(1)

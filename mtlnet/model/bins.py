@@ -1,13 +1,14 @@
-"""Distances and angle as distributions over bins: targets, and the answer computed from scores.
+"""Distributions over bins for distances and angle: the targets, and the answer from the scores.
 
 A distance is a softmax over `DISTANCE_BINS` bins of its range (`trackfeatures.RANGES`) and a class
 "absent"; the angle is a softmax over `ANGLE_BINS` bins. The target of a value is a normal
 distribution around it, integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al.
 2024). The answer is the expectation over the bins within `NEAR` of the likeliest bin. Where a
-marking's distance jumps to that of the next marking, a regression would answer with a value in
-between; a distribution has two peaks, and one of them is chosen.
+distance jumps from one marking to the next, a regression would answer with a value in between; a
+distribution has two peaks, and the answer is at the higher one.
 
-Torch operations without branches, so that they can be part of an exported network.
+The functions are torch operations without branches, so that they can be part of an exported
+network.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from mtlnet.architecture import ABSENT_ABOVE, ANGLE_BINS, BIN_VARIANCE, DISTANCE
 from trackfeatures.coding import OFFSET, SPAN
 
 SPREAD = 1.0
-"""Standard deviation of a target, in bins."""
+"""Standard deviation of a target distribution, in bins."""
 
 _SPANS = [tf.RANGES[name] for name in tf.TARGETS]
 
@@ -56,7 +57,8 @@ def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tenso
 
 
 def bin_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
-    """Target distributions of coded targets (B, 6): (B, 5, DISTANCE_BINS + 1), (B, ANGLE_BINS)."""
+    """Target distributions (B, 5, DISTANCE_BINS + 1) of the distances and (B, ANGLE_BINS) of the
+    angle, for coded targets (B, 6)."""
     values = _decoded(coded)
     absent = absent_in(coded)
     each = []
@@ -82,12 +84,13 @@ def absent_in(coded: Tensor) -> Tensor:
 
 
 _SAME = 1e-4
-"""Coded values that differ by less are equal. The rounding error of float32 is a thousandth of it;
-the nearest code of a present marking is 0.02 away."""
+"""Coded values that differ by less than this count as equal. The rounding error of float32 is a
+thousandth of it; the code of a present marking differs from the code of absence by 0.02 or more."""
 
 
 def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
-    """Coded answers (B, 6) of scores (B, 5, DISTANCE_BINS + 1) and (B, ANGLE_BINS).
+    """Coded answers (B, 6): five distances and the angle, from the scores (B, 5, DISTANCE_BINS + 1)
+    and (B, ANGLE_BINS).
 
     A distance whose probability of absence exceeds `ABSENT_ABOVE` is coded as the inactive end of
     its range, as in a label.
@@ -112,9 +115,8 @@ def absent_probabilities(distance: Tensor) -> Tensor:
 
 
 def expectation(scores: Tensor) -> Tensor:
-    """Expected position in the range, in [0, 1], from the scores (..., count) of its bins.
-
-    Only the bins within `NEAR` of the likeliest one count.
+    """Expected values (...) in [0, 1], the share of the range, from the scores (..., count) of its
+    bins. Only the bins within `NEAR` of the likeliest bin are included.
     """
     count = scores.shape[-1]
     number = torch.arange(count, dtype=torch.float32, device=scores.device)
@@ -125,15 +127,17 @@ def expectation(scores: Tensor) -> Tensor:
 
 
 def log_spreads(distance: Tensor, angle: Tensor) -> Tensor:
-    """Logarithms (B, 6) of the standard deviations, in bins, of the distributions of the scores.
+    """Logarithms (B, 6) of the standard deviations, in bins, of the distributions that the scores
+    (B, 5, DISTANCE_BINS + 1) and (B, ANGLE_BINS) define.
 
-    All bins except "absent" count, so that two separate peaks are a wide distribution.
+    All bins except "absent" are included, so that two separate peaks give a large value.
     """
     spreads = [_log_spread(distance[:, :, :-1]), _log_spread(angle)[:, None]]
     return torch.cat(spreads, 1)
 
 
 def _log_spread(scores: Tensor) -> Tensor:
+    """Logarithms (...) of the standard deviations, in bins, for scores (..., count)."""
     number = torch.arange(scores.shape[-1], dtype=torch.float32, device=scores.device)
     share = torch.softmax(scores.float(), -1)
     mean = (share * number).sum(-1, keepdim=True)
@@ -146,6 +150,7 @@ def soft_cross_entropy(scores: Tensor, targets: Tensor) -> Tensor:
 
 
 def _ranges(like: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower ends (6,) and widths (6,) of the ranges, in m and rad, like the tensor `like`."""
     low = _numbers([span.lo for span in _SPANS], like)
     return low, _numbers([span.hi for span in _SPANS], like) - low
 

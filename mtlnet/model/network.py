@@ -49,8 +49,11 @@ CODED_HEADS = (("distance", slice(0, 5)), ("angle", slice(5, 6)))
 
 
 class Network(nn.Module):
-    """The network. With `batch_norm` and non-default `target_*` it has the form that `fast`
-    trains."""
+    """A network of the given architecture.
+
+    Recipe `fast` trains it with `batch_norm`, and with `target_mean` and `target_std` other than 0
+    and 1.
+    """
 
     target_mean: Tensor
     target_std: Tensor
@@ -72,7 +75,8 @@ class Network(nn.Module):
         self.auxiliary = None
         if architecture.bins and architecture.keeps_places and batch_norm:
             self.auxiliary = AuxiliaryHeads(architecture, size)
-        # Mean and deviation of the targets: (0, 1) as in the paper, set by recipe `fast`.
+        # Mean and standard deviation of the coded targets; 0 and 1, as in the paper, until the
+        # trainer sets them.
         self.register_buffer("target_mean", torch.zeros(6), persistent=batch_norm)
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
 
@@ -87,7 +91,7 @@ class Network(nn.Module):
 
     def forward_grid(self, images: Tensor) -> Tensor:
         """Features (B, C, h, w) of the last convolution for images (B, 210, 280, 3)."""
-        # Counted from the bottom: images may lack the rows at the top, which are not read.
+        # `first_row` is counted from the bottom, because images may lack the unread rows above it.
         images = images[:, images.shape[1] - HEIGHT + self.architecture.first_row :]
         x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
         grid: Tensor = self.features(x)
@@ -114,7 +118,8 @@ class Network(nn.Module):
     def uncertainty_inputs(self, x: Tensor) -> Tensor:
         """Inputs of the uncertainty head (B, `architecture.uncertainty_inputs`).
 
-        The last shared features x (B, 256) and, for heads over bins, the logarithms of the spreads.
+        They are the last shared features x (B, 256) and, for heads over bins, the logarithms of the
+        distributions' standard deviations.
         """
         if not self.architecture.bins:
             return x
@@ -122,21 +127,20 @@ class Network(nn.Module):
         return torch.cat([x.float(), log_spreads(scores.distance, scores.angle)], 1)
 
     def absent_probabilities(self, x: Tensor) -> Tensor:
-        """Probabilities (B, 5) that each marking is absent, of heads over bins.
-
-        `x` (B, 256): the last shared features.
-        """
+        """Probabilities (B, 5) that each marking is absent, from the last shared features (B, 256)
+        of a network with heads over bins."""
         return absent_probabilities(self.forward_scores(x).distance)
 
     def forward_scores(self, x: Tensor) -> Scores:
-        """Scores of heads over bins for last shared features (B, 256)."""
+        """Scores of the heads, before softmax, for last shared features (B, 256) of a network with
+        heads over bins."""
         with torch.autocast(x.device.type, enabled=False):
             each = [self.heads[name](x.float()) for name, _ in self.architecture.heads]
             return split_scores(*each)
 
 
 def normalise(images: Tensor) -> Tensor:
-    """float32 colours in [-1, 1] from uint8 colours, as in the exported graph."""
+    """uint8 colours of any shape, scaled to float32 in [-1, 1] as in the exported graph."""
     return images.float() * (1 / 127.5) - 1.0
 
 
@@ -156,7 +160,7 @@ def initialise(network: Network, seed: int) -> None:
 
 
 def load_network(path: Path, name: str = MTL.name) -> Network:
-    """The network called `name` with the weights of a `model.safetensors`."""
+    """The network called `name`, in evaluation mode, with the weights in the file `path`."""
     network = Network(architecture=find_architecture(name))
     with utf8_path(path) as plain:
         network.load_state_dict(load_file(plain))
@@ -164,7 +168,8 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
 
 
 def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Outputs (B, 9) for images (B, 210, 280, 3), computed in batches of `RUN_BATCH`."""
+    """Coded distances and angle, and class probabilities (B, 9) for uint8 images (B, 210, 280, 3),
+    computed in batches of `RUN_BATCH`."""
     network.eval()
     device = next(network.parameters()).device
     parts = []
@@ -179,7 +184,10 @@ def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.fl
 
 
 class SamePad(nn.Module):
-    """Zero padding before a layer that together is TensorFlow's SAME padding."""
+    """Zero padding that gives the next `layer` TensorFlow's SAME padding.
+
+    `height`, `width`: size in px of the map that is padded.
+    """
 
     def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:
         super().__init__()
@@ -218,7 +226,8 @@ def block(
 
 
 def build_features(architecture: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """Module before the fully connected layers, (B, 3, H, W) -> (B, ...), and its output size."""
+    """The module before the fully connected layers, which maps images (B, 3, H, W) to features
+    (B, ...), and the number of features of one image."""
     if architecture.backbone:
         return build_backbone(architecture.backbone, batch_norm=batch_norm)
     features = nn.Sequential()
@@ -281,7 +290,7 @@ def fold(network: Network) -> Network:
     """An equivalent network without batch normalisation and target standardisation, in evaluation
     mode.
 
-    For `mtl` it is the paper's network. Computed in float64.
+    For `mtl` it is the paper's network. The new weights are computed in float64.
     """
     double = copy.deepcopy(network).cpu().double()
     fold_norms(double)

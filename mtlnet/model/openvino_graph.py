@@ -1,11 +1,11 @@
-"""A trained network as an OpenVINO graph, converted from the torch network.
+"""Converts a trained torch network to an OpenVINO graph.
 
 The graph is written beside the weights, so that `serve` loads it without torch.
 
-The heads, the uncertainty head and the textures are computed in float32 even where the rest is in
-bf16: OpenVINO rounds the results of a MatMul to bf16, in steps of
-0.004 near 1, which is 0.025 m or 0.005 rad of a head with coded values. The directions of
-the texture stay in bf16: their result, a sum of squares, is then wrong by 0.1 %, at most 0.5 %.
+The heads, the uncertainty head and the textures are computed in float32 even if the other layers
+are in bf16: OpenVINO rounds the results of a MatMul to bf16, in steps of 0.004 near 1, which is
+0.025 m or 0.005 rad for a head with coded values. The MatMul with the texture directions stays in
+bf16: its result, a sum of squares, then has an error of 0.1 %, at most 0.5 %.
 """
 
 import errno
@@ -24,20 +24,20 @@ from mtlnet.model.uncertainty_head import UncertaintyHead
 from runtime.files import fsync_path, utf8_path
 
 TOLERANCE = 2e-4
-"""Tolerance: largest absolute difference of an output (coded value or probability) from torch in
+"""Largest allowed absolute difference of an output (coded value or probability) from torch in
 float32."""
 UNCERTAINTY_TOLERANCE = 5e-3
-"""Tolerance: largest relative difference of a standard deviation or the OOD score."""
+"""Largest allowed relative difference of a standard deviation or the out-of-distribution score."""
 DIRECTIONS = "__module.head/aten::linear/MatMul"
-"""Name of the product with `UncertaintyHead.texture_directions`."""
+"""Name of the graph's MatMul with `UncertaintyHead.texture_directions`."""
 MIN_NARROW_VALUES = 256  # smaller constants stay in float32
 
 
 def build_graph(network: Network, head: UncertaintyHead | None = None, batch: int = 1) -> Any:
     """OpenVINO model of a folded network: uint8 images (B, 210, 280, 3) -> float32 (B, K).
 
-    `mtlnet.inference.prediction.split_outputs` explains the K columns. `batch`: number of images;
-    -1: any number, which is slower for a single image.
+    `mtlnet.inference.prediction.split_outputs` explains the K columns. `batch`: number of images, 1
+    or -1; -1 allows any number, and is slower for a single image.
     """
     return _converted(ServedNetwork(network, head), batch)
 
@@ -115,7 +115,7 @@ def _converted(module: nn.Module, batch: int) -> Any:
     import openvino
 
     example = torch.zeros((2, HEIGHT, WIDTH, 3), dtype=torch.uint8)
-    with warnings.catch_warnings():  # about the constants in the traced code
+    with warnings.catch_warnings():  # torch's tracer warns about the constants in the code
         warnings.simplefilter("ignore")
         model = openvino.convert_model(
             module.eval(),
@@ -129,8 +129,8 @@ def _converted(module: nn.Module, batch: int) -> Any:
 
 
 def _keep_float32(model: Any) -> None:
-    """Replace the products of the heads and the uncertainty head by products and sums of numbers,
-    which OpenVINO leaves in float32 (in place)."""
+    """Replace each MatMul of the heads and of the uncertainty head, except `DIRECTIONS`, by
+    elementwise products and sums, which OpenVINO leaves in float32 (in place)."""
     products = [op for op in model.get_ordered_ops() if op.get_type_name() == "MatMul"]
     for product in products:
         name = product.get_friendly_name()
@@ -141,7 +141,8 @@ def _keep_float32(model: Any) -> None:
 
 
 def _sum_of_products(x: Any, weight: Any) -> Any:
-    """Product (B, N) of x (B, F) and the transpose of weight (N, F)."""
+    """Matrix product (B, N) of `x` (B, F) and the transpose of `weight` (N, F), from elementwise
+    operations; B is 1 unless it is dynamic."""
     from openvino import opset13 as ops
 
     if x.get_partial_shape()[0].is_dynamic:
@@ -149,5 +150,5 @@ def _sum_of_products(x: Any, weight: Any) -> Any:
         # The sum must keep the axis: OpenVINO 2026.4 otherwise adds a following bias (1, N) to the
         # wrong values.
         return ops.squeeze(ops.reduce_sum(each, np.array([2]), keep_dims=True), np.array([2]))
-    # In two dimensions: OpenVINO would reorder three dimensions as the channels of an image.
+    # Two dimensions, because OpenVINO would reorder three dimensions as the channels of an image.
     return ops.unsqueeze(ops.reduce_sum(ops.multiply(x, weight), np.array([1])), np.array([0]))

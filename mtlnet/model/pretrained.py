@@ -1,9 +1,9 @@
-"""Initialise a network from a finished model, whose batch normalisation was folded away.
+"""Initialises a network from a finished model, whose batch normalisation was folded away.
 
-A network without batch normalisation gets the model's weights. A network with it gets statistics
-measured on images, and scales and biases that undo them, so that its outputs are the same. The
-network may have more residual convolutions than the model; they start near the identity (as in Chen
-et al. 2016, Net2Net).
+A network without batch normalisation gets the model's weights. A network with batch normalisation
+also gets statistics measured on images, and gains and biases that undo this normalisation, so that
+its outputs equal those of the model. The network may have more residual convolutions than the
+model; the additional ones start near the identity (as in Chen et al. 2016, Net2Net).
 """
 
 from pathlib import Path
@@ -18,19 +18,20 @@ from mtlnet.model.network import CODED_HEADS, Network, load_network, normalise
 from trackfeatures.errors import UserError
 
 NEW_SCALE = 0.02
-"""Scale of the normalised outputs of a new residual convolution. With 0 its ReLU would pass no
-gradient."""
+"""Initial gain of the batch normalisation of a new residual convolution. With 0 its ReLU would pass
+no gradient."""
 
 
 def load_pretrained(
     network: Network, weights: Path, images: NDArray[np.uint8] | None = None, name: str = ""
 ) -> None:
-    """Make `network` compute the outputs of a finished model, in the units of its own heads.
+    """Set the weights of `network` so that it computes the outputs of a finished model. The units
+    of its heads (`target_mean`, `target_std`) do not change.
 
-    `weights`: the model's file. `images` (B, 210, 280, 3): the statistics of the network's batch
-    normalisation are measured on them; None for a network without it. `name`: the model's
-    architecture, if it is not the network's. Raises UserError when the network does not contain the
-    model.
+    `weights`: the model's file. `images` uint8 (B, 210, 280, 3): images on which the statistics of
+    the batch normalisation are measured; None for a network without batch normalisation. `name`:
+    the model's architecture; empty: the network's architecture. Raises UserError when the network
+    does not contain all convolutions of the model.
     """
     source = load_network(weights, name or network.architecture.name)
     state = source.state_dict()
@@ -55,8 +56,8 @@ def load_pretrained(
 
 
 def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
-    """Submodule names of the convolutions of `old`, each with the name of the same convolution in
-    `new`.
+    """A dict from the submodule name of each convolution of `old` to the name of the same
+    convolution in `new`.
 
     `new` may have more residual convolutions. Raises UserError for any other difference.
     """
@@ -84,8 +85,9 @@ def restore_batch_norm(
 ) -> None:
     """Set the batch normalisations of a network that has the filters of a folded model.
 
-    `biases`: the biases of the model's convolutions, by submodule name; other convolutions are new.
-    The filters are rescaled to the size of newly initialised ones, which suits the optimizer's
+    `biases`: the biases of the model's convolutions, by submodule name; convolutions without an
+    entry are new. `images` uint8 (B, 210, 280, 3): images on which the statistics are measured. The
+    filters are rescaled to the size of newly initialised filters, which suits the optimizer's
     steps; batch normalisation undoes the scale.
     """
     network.eval()

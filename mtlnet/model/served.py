@@ -1,7 +1,7 @@
-"""The network as it is served: everything that an answer holds, computed from uint8 images.
+"""The served network, which computes all outputs of a model from uint8 images.
 
-The one definition of the served computation. The torch engine runs it, and the OpenVINO graph is
-converted from it (`mtlnet.model.openvino_graph`).
+This module is the only definition of the served computation. The torch engine runs it, and the
+OpenVINO graph is converted from it (`mtlnet.model.openvino_graph`).
 """
 
 import torch
@@ -15,8 +15,8 @@ from mtlnet.model.uncertainty_head import UncertaintyHead
 class ServedNetwork(nn.Module):
     """A folded network, its softmax, and its uncertainty head if it has one.
 
-    uint8 images (B, 210, 280, 3) -> float32 (B, K); `mtlnet.inference.prediction.split_outputs`
-    explains the K columns.
+    It maps uint8 images (B, 210, 280, 3) to float32 (B, K);
+    `mtlnet.inference.prediction.split_outputs` explains the K columns.
     """
 
     def __init__(self, network: Network, head: UncertaintyHead | None = None) -> None:
@@ -34,8 +34,9 @@ class ServedNetwork(nn.Module):
 
 
 class FitInputs(ServedNetwork):
-    """The data that the uncertainty head is fitted on: the nine outputs, the inputs of the head (B,
-    X) and the textures (B, C + M; `mtlnet.model.textures`)."""
+    """Computes the data on which the uncertainty head is fitted, from uint8 images (B, 210, 280,
+    3): the nine outputs (B, 9), the network's inputs of the head (B, X) and the texture features
+    (B, C + M) of `mtlnet.model.textures`."""
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
         x = self.network.forward_features(images)

@@ -1,10 +1,11 @@
-"""Texture features of an image, from which the out-of-distribution score and the light are
+"""Texture features of an image, from which the out-of-distribution score and the light features are
 computed.
 
-An image is divided into 14 x 8 cells of three bands each. A cell or a band has mean colours in
-[-1, 1], and the square roots of the mean absolute differences of brightness between horizontal and
-vertical neighbours. Torch operations without branches, so that they can be part of an exported
-network; B is the number of images, C = CELL_VALUES, M = CENTRE_VALUES.
+An image is divided into 14 x 8 cells of three bands, one above the other. The features of a cell or
+band are its mean colours in [-1, 1], and the square roots of the mean absolute differences of
+brightness between horizontal and vertical neighbours. The functions are torch operations without
+branches, so that they can be part of an exported network. In shapes B is the number of images,
+C = CELL_VALUES, M = CENTRE_VALUES.
 """
 
 import torch
@@ -23,7 +24,7 @@ HALVES = 2  # upper and lower half of an image
 LIGHT_VALUES = PLANES * HALVES
 SQRT_EPSILON = 1e-6
 """Added to a mean difference before the square root; the difference is 0 in a flat cell."""
-LEVEL = 1 / 127.5  # of a colour's step, where colours lie in [-1, 1]
+LEVEL = 1 / 127.5  # difference of two successive uint8 colours on the scale [-1, 1]
 
 
 def texture_features(images: Tensor) -> Tensor:
@@ -47,10 +48,10 @@ def band_sums(images: Tensor) -> tuple[Tensor, int]:
     of pixels of a band.
 
     The planes are red, green, blue, and the absolute differences of red + green + blue from the
-    next column and from the next row; the last column and row differ by 0 from theirs. All sums are
-    of integers below 2**24, and therefore exact in float32.
+    next column and from the next row, which are 0 in the last column and row. All sums are integers
+    below 2**24, and therefore exact in float32.
     """
-    colours = images.permute(0, 3, 1, 2)  # on bytes: faster than on floats
+    colours = images.permute(0, 3, 1, 2)  # before the conversion, because bytes are faster
     red, green, blue = (colours[:, k : k + 1].float() for k in range(COLOURS))
     grey = red + green + blue
     across = (pad(grey, (0, 1, 0, 0), mode="replicate")[..., 1:] - grey).abs()
@@ -61,8 +62,8 @@ def band_sums(images: Tensor) -> tuple[Tensor, int]:
 
 
 def _sums(planes: Tensor) -> Tensor:
-    """Sums over each band (B, N, bands, columns) of planes (B, N, H, W); not by a pool, which
-    OpenVINO computes on planes in blocks of 16."""
+    """Sums over each band (B, N, bands, columns) of planes (B, N, H, W), without a pooling layer,
+    because OpenVINO computes pooling in blocks of 16 planes."""
     count, height, width = (int(size) for size in planes.shape[1:])
     bands = CELL_ROWS * BANDS
     rows = planes.reshape(-1, count, bands, height // bands, width).sum(3)
@@ -77,6 +78,7 @@ def light_features(textures: Tensor) -> Tensor:
 
 
 def _with_roots(planes: Tensor) -> Tensor:
-    """Values (B, N) of planes (B, PLANES, h, w), with the square roots of the differences."""
+    """Values (B, N) of planes (B, PLANES, h, w): the colours, and the square roots of the
+    differences."""
     roots = torch.sqrt(planes[:, COLOURS:] + SQRT_EPSILON)
     return torch.cat([planes[:, :COLOURS], roots], 1).flatten(1)

@@ -1,19 +1,20 @@
-"""The uncertainty head: a standard deviation for each feature, and an out-of-distribution score.
+"""The uncertainty head computes a standard deviation for each feature, and an out-of-distribution
+score.
 
 Standard deviations: two layers predict the logarithm of the standard deviation of the error of each
-feature (Nix and Weigend 1994). Their inputs, all standardised, are the network's last shared
-features (256,), the logarithms of the spreads (6,) if its heads are distributions over bins, and
-the light of the image (10,) (`mtlnet.model.textures.light_features`). Without the light the
-standard deviations are too large in dusk and fog and too small in snow and heavy shadow. The
-network's nine outputs do not change.
+feature (Nix and Weigend 1994). Their standardised inputs are the network's last shared features
+(256,), for heads over bins the logarithms of the distributions' standard deviations (6,), and the
+light features (10,) of the image (`mtlnet.model.textures.light_features`). Without the light
+features the standard deviations are too large in dusk and fog and too small in snow and heavy
+shadow. The network's nine outputs do not depend on this head.
 
-Out-of-distribution (OOD) score: the larger of two values. Each is scaled so that 1 is the limit of
-what counts as known.
+The out-of-distribution (OOD) score is the larger of two values. Each is scaled so that an image is
+out of distribution if the value is above 1.
 
 - The squared Mahalanobis distance of the image's texture features from those of the training frames
-  (Lee et al. 2018). The last shared features do not serve: a network trained on roads maps other
-  images near their mean. Measured on a model of 230 steps at 1 % false alarms: the last features
-  detect 1 % of noise and text images, the texture features all of them.
+  (Lee et al. 2018). The last shared features are unsuitable, because a network trained on roads
+  maps other images near their mean. In a measurement with a model of 230 steps at 1 % false alarms,
+  the last features detected 1 % of noise and text images, the texture features all of them.
 - The square of the camera's pitch offset, predicted by two layers from the texture features of the
   image centre: a camera that looks up or down sees the same textures slightly higher or lower.
 """
@@ -49,8 +50,9 @@ class TwoLayers(nn.Module):
 class UncertaintyHead(nn.Module):
     """The head with the weights of `state`, a state dict of this module.
 
-    F inputs, D features, C cell and M centre values. Raises KeyError for a tensor that is missing,
-    RuntimeError for shapes that do not fit each other.
+    In shapes F is the number of inputs, D of track features, C of texture values of the cells, M of
+    texture values of the image centre. Raises KeyError for a missing tensor, RuntimeError for
+    shapes that do not fit each other.
     """
 
     centre: Tensor  # (F,)
@@ -80,8 +82,8 @@ class UncertaintyHead(nn.Module):
     def forward(self, x: Tensor, textures: Tensor) -> Tensor:
         """Standard deviations and the OOD score, (B, D + 1).
 
-        `x` (B, X): the network's inputs of this head; `textures` (B, C + M): see
-        `mtlnet.model.textures`. A head fitted on fewer inputs reads only the first of these inputs.
+        `x` (B, X): result of `Network.uncertainty_inputs`; a head fitted on fewer inputs reads only
+        the first columns. `textures` (B, C + M): result of `mtlnet.model.textures`.
         """
         count = min(int(x.shape[1]), len(self.centre))
         z = x[:, :count]
@@ -96,10 +98,10 @@ class UncertaintyHead(nn.Module):
         return torch.cat([log_std.exp(), torch.maximum(distance, pitch * pitch)], 1)
 
     def pitch_offset(self, centre: Tensor) -> Tensor:
-        """Pitch of the camera relative to the training camera, (B, 1), positive downwards.
+        """Pitch of the camera relative to the training camera, (B, 1), positive downwards, in
+        multiples of the limit above which an image is out of distribution.
 
-        `centre` (B, M): the texture features of the image centre. 1 is the limit of what counts as
-        known.
+        `centre` (B, M): the texture features of the image centre.
         """
         offset: Tensor = self.pitch((centre - self.pitch_centre) * self.pitch_scale)
         return offset
@@ -143,10 +145,10 @@ def load_uncertainty_head(path: Path) -> UncertaintyHead:
 
 
 def standardise(x: Tensor, centre: Tensor, scale: Tensor, count: int) -> Tensor:
-    """Standardised inputs (N, F) of the standard deviations.
+    """Standardised inputs (N, F) of the layers that predict the standard deviations.
 
-    The first `count` inputs are the network's; the remaining inputs are the light, which is
-    clipped.
+    The first `count` columns of `x` (N, F) come from the network; the remaining columns are light
+    features, which are clipped to +-`LIGHT_LIMIT`.
     """
     z = (x - centre) * scale
     return torch.cat([z[:, :count], z[:, count:].clamp(-LIGHT_LIMIT, LIGHT_LIMIT)], 1)

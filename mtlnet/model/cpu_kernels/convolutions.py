@@ -1,14 +1,16 @@
-"""Convolutions in forms that a CPU computes fast: the first layer, and those with small maps.
+"""Computes the first convolution, and convolutions of small feature maps, in forms that are fast on
+a CPU.
 
-The first layer (11 x 11, stride 4, 3 colours) becomes 3 x 3 with stride 1 on 48 channels by space
-to depth: a block of 4 x 4 pixels becomes one pixel with 48 channels (row, column, colour). With
-SAME padding a window starts 4 rows and 3 columns before its block, so 3 x 3 blocks contain it; the
-kernel is padded to 12 x 12. CPUs compute this three times as fast as the form with 3 channels. A
-convolution of 12 x 12 with four zeros around the image has this form already.
+Space to depth turns each block of 4 x 4 pixels into one pixel with 48 channels (row, column,
+colour). The first layer of `mtl` (11 x 11, stride 4, 3 colours) then becomes a 3 x 3 convolution
+with stride 1: with SAME padding a window starts 4 rows and 3 columns before its block, so 3 x 3
+blocks contain the window, and the kernel is padded to 12 x 12. CPUs compute this form three times
+as fast as the form with 3 channels. The first layer of `grid` (12 x 12, padding 4) needs no padding
+of its kernel.
 
-The last three layers have inputs of at most 7 x 9 pixels and most of the weights. There a CPU
-spends most of the time of a convolution on reordering weights. One matrix product (im2col) uses the
-weights as they are stored and takes a sixth of the time.
+The last three convolutions of `mtl` have inputs of at most 7 x 9 pixels and most of the weights. A
+CPU spends most of the time of these convolutions on reordering weights. One matrix product (im2col)
+uses the weights as they are stored and takes a sixth of the time.
 """
 
 from typing import Any
@@ -23,12 +25,13 @@ from mtlnet.model.cpu_kernels.elementwise import as_rows, centre, in_threads
 BLOCK = 4
 ROW_BYTES = 12  # bytes of one row of a block: four pixels of three colours
 COLOUR_OFFSET = 127.5
-"""The uint8 value that is normalised to 0. It and all colours minus it are exact in bf16."""
+"""The colour that is normalised to 0. bf16 holds it and its differences from all uint8 colours
+exactly."""
 
 
 def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Blocks of 4 x 4 px as channels: uint8 (B, H, W, 3) -> (B, 48, ceil(H / 4), W / 4),
-    channels-last.
+    """Images uint8 (B, H, W, 3) with blocks of 4 x 4 px as channels: (B, 48, ceil(H / 4), W / 4) of
+    type `dtype`, channels-last.
 
     Values are colours minus `COLOUR_OFFSET`; rows below the image are 0. W must be a multiple of 4.
     """
@@ -55,7 +58,8 @@ def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
 def space_to_depth_convolution(
     x: Tensor, weight: Tensor, bias: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
-    """Convolution of x (B, 48, h, w) with `weight` (F, 3, 11, 11) or (F, 3, 12, 12)."""
+    """The first convolution with stride 4, (B, F, h, w), computed from the result (B, 48, h, w) of
+    `space_to_depth`. `weight` is (F, 3, 11, 11) or (F, 3, 12, 12)."""
     short = 3 * BLOCK - weight.shape[2]
     kernel = pad(weight * (1 / COLOUR_OFFSET), (short, 0, 0, short))
     filters = len(weight)

@@ -1,9 +1,10 @@
-"""Compiled passes over channels-last values (N, C): network input, batch normalisation, ReLU.
+"""Compiled loops over channels-last values (N, C), for the network's input, batch normalisation and
+ReLU.
 
-For bf16 in channels-last order torch needs more passes and several times as long. Values are bf16
-(given as uint16), float32 or float64. Parameters of a channel (C,) and computed values are float32,
-or float64 for float64 values. Sums are in that type within blocks of `BLOCK_ROWS` rows and in
-float64 over the blocks. `in_threads` runs a pass on all threads of torch.
+torch reads bf16 values in channels-last order more often and takes several times as long. Values
+are bf16 (stored as uint16), float32 or float64. Parameters of a channel (C,) and computed values
+are float32, or float64 for float64 values. Sums have that type within blocks of `BLOCK_ROWS` rows
+and are float64 over the blocks. `in_threads` runs a loop on as many threads as torch uses.
 """
 
 from collections.abc import Callable
@@ -57,14 +58,17 @@ def _typed_narrow(typing_context: Any, value: Any, like: Any) -> Any:
 
 
 widen: Any = intrinsic(_typed_widen)
-"""A stored value converted to float32 or float64."""
+"""`widen(value)`: a stored bf16 value converted to float32; values of other types unchanged."""
 narrow: Any = intrinsic(_typed_narrow)
 """`narrow(value, like)`: a computed value converted to the type of the stored value `like`."""
 
 
 @compiled_for_threads
 def add_moments(x: Values, origin: Values, total: Sums, squares: Sums) -> None:
-    """Add the sums over N of x - `origin` (C,), and of its squares, to `total` and `squares`."""
+    """Add the sums over the rows of x - `origin`, and of its squares, to `total` and `squares`.
+
+    `x` is (N, C); `origin`, `total` and `squares` are (C,).
+    """
     rows, channels = x.shape
     sums, products = np.zeros_like(origin), np.zeros_like(origin)
     for start in range(0, rows, BLOCK_ROWS):
@@ -89,7 +93,7 @@ def add_moments(x: Values, origin: Values, total: Sums, squares: Sums) -> None:
 
 @compiled_for_threads
 def affine_relu(x: Values, a: Values, b: Values, out: Values) -> None:
-    """Set `out` (N, C) to relu(a x + b)."""
+    """Set `out` (N, C) to relu(a x + b) for `x` (N, C), `a` and `b` (C,)."""
     zero = a.dtype.type(0)
     for n in range(x.shape[0]):
         for c in range(x.shape[1]):
@@ -107,10 +111,10 @@ def add_gradient_sums(
     sums: Sums,
     products: Sums,
 ) -> None:
-    """Add the sums over N of g and of g (x - mean) to `sums` and `products` (C,).
+    """Add the sums over the rows of g and of g (x - mean) to `sums` and `products` (C,).
 
-    g is the gradient with respect to a x + b; `gradient` (N, C) is that with respect to relu(a x +
-    b).
+    g (N, C) is the gradient of the loss with respect to a x + b. It is computed from `gradient`
+    (N, C), the gradient with respect to relu(a x + b).
     """
     zero = a.dtype.type(0)
     block_sums, block_products = np.zeros_like(a), np.zeros_like(a)
@@ -158,9 +162,9 @@ def centre(pixels: NDArray[np.uint8], offset: float, out: Values) -> None:
 
 
 def as_rows(x: Tensor) -> Values:
-    """Values (B, C, H, W) as an array (B H W, C).
+    """The values of `x` (B, C, H, W) as an array (B * H * W, C), with bf16 stored as uint16.
 
-    It shares their memory if they are channels-last.
+    The array shares the memory of `x` if `x` is channels-last.
     """
     last = x.permute(0, 2, 3, 1).contiguous()
     stored = last.view(torch.uint16) if x.dtype == torch.bfloat16 else last

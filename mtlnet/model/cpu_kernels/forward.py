@@ -1,6 +1,5 @@
-"""Forward pass of the network in training on a CPU: the result of `Network.forward`, faster.
-
-Evaluation and training on a GPU use `Network.forward`.
+"""Forward pass for training on a CPU. It computes the outputs of `Network.forward` in less time;
+evaluation and training on a GPU use `Network.forward`.
 """
 
 from collections.abc import Sequence
@@ -31,7 +30,7 @@ def training_outputs(
 ) -> Tensor:
     """Outputs (B, 9) float32 for images uint8 (B, 210, 280, 3), computed in `dtype`.
 
-    `masks`: see `forward_features`.
+    `masks`: scaled dropout masks (B, units) of the shared layers; empty: no dropout.
     """
     return network.forward_heads(forward_features(network, images, dtype, masks))
 
@@ -63,7 +62,8 @@ def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor
 def forward_shared(
     network: Network, grid: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Last shared features (B, 256) of the last convolution's features (B, C, h, w)."""
+    """Last shared features (B, 256), computed from the features (B, C, h, w) of the last
+    convolution."""
     x = grid.flatten(1)
     for number in range(len(network.architecture.shared)):
         layer = network.shared.get_submodule(f"fc{number}.layer")
@@ -91,7 +91,8 @@ def _layer(x: Tensor, number: int, spec: Conv, pool: Pool | None, block: nn.Modu
 
 
 def _folded(layer: nn.Conv2d, norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
-    """Filters and biases of a convolution with its frozen batch normalisation folded in."""
+    """Filters (F, C, k, k) and biases (F,) that compute a convolution and its frozen batch
+    normalisation in one."""
     assert norm.running_mean is not None
     assert norm.running_var is not None
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)

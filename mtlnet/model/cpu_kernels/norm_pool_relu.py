@@ -1,8 +1,8 @@
 """Fused batch normalisation, max pooling and ReLU for training.
 
-max(relu(a x + b)) = relu(a max(x) + b) for a >= 0. So pooling comes first and saves three quarters
-of the work; where a is negative, the caller negates the filter and a. The statistics are computed
-over the batches of all processes (Ioffe and Szegedy 2015, algorithm 1).
+max(relu(a x + b)) = relu(a max(x) + b) for a >= 0. Therefore pooling is computed first, which saves
+three quarters of the work. Where a is negative, the caller negates the filter and a. The statistics
+are computed over the batches of all processes (Ioffe and Szegedy 2015, algorithm 1).
 """
 
 from typing import Any
@@ -29,9 +29,10 @@ native = torch.ops.aten
 
 
 def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
-    """Arguments of `max_pool2d` for SAME padding: `padding` before, `ceil_mode` after.
+    """Arguments that give `max_pool2d` TensorFlow's SAME padding for maps of `height` x `width` px.
 
-    Before a ReLU this equals the zero padding of `mtlnet.model.network`.
+    `padding` pads the top and left edges, `ceil_mode` the bottom and right edges. torch pads with
+    minus infinity; followed by a ReLU, the result equals that with zeros (`mtlnet.model.network`).
     """
     before = [same_padding(size, pool.kernel, pool.stride)[1] for size in (height, width)]
     return {
@@ -43,10 +44,8 @@ def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
 
 
 def statistics(x: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Mean (C,), biased variance (C,) and number of values x (B, C, H, W), over all processes.
-
-    The result is float32 for bf16 values.
-    """
+    """Mean (C,), biased variance (C,) and number of values of each channel of x (B, C, H, W), over
+    the batches of all processes. Mean and variance are float32 for bf16 values."""
     values = as_rows(x.detach())
     count = len(values)
     dtype = torch.promote_types(x.dtype, torch.float32)
@@ -155,8 +154,8 @@ def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -
 def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
     """Batch normalisation, max pooling and ReLU of x (B, C, H, W).
 
-    x is the output of the convolution times `sign` (C,), the sign of the normalisation's gain.
-    Updates the running statistics of `norm` as torch does.
+    x is the output of the convolution times `sign` (C,), the sign of the normalisation's gain
+    `norm.weight`. The running statistics of `norm` are updated as torch does.
     """
     with torch.no_grad():
         mean, variance, count = statistics(x)
