@@ -1,8 +1,10 @@
-"""A user's own labelled pictures (a folder with `labels.csv`), rectified to the model's camera.
+"""Reads a user's own labelled pictures (a folder with `labels.csv`) for `mtlnet train --init RUN`
+and `mtlnet evaluate`.
 
-`mtlnet train --init RUN` and `mtlnet evaluate` use them. The camera of a picture is the camera file
-named in its row, else `camera.yaml` in the folder, else the model's camera. Pictures of another
-camera than the model's are rectified (`mtlnet.inference.rectification`).
+The camera file named in a picture's row describes the picture's camera. If the row names no file,
+`camera.yaml` in the folder describes it; without that file it is the model's camera. Pictures of
+another camera than the model's are rectified to the model's camera
+(`mtlnet.inference.rectification`).
 """
 
 import hashlib
@@ -34,9 +36,7 @@ MAX_READERS = 8  # number of threads; each may hold a photo of 0.8 GB
 @dataclass(frozen=True)
 class CustomImages:
     """N labelled pictures in memory, uint8 (N, H, W, 3) at the size of the model's camera (0.18 MB
-    each).
-
-    Each picture and each of its copies is one entry of every sequence.
+    each). A copy of a picture counts as a picture: every sequence has N entries.
     """
 
     path: Path
@@ -48,7 +48,7 @@ class CustomImages:
     lenses: tuple[Rectification | None, ...]
     """Rectification of each picture; None where the model's camera took it."""
     copies: tuple[str, ...]
-    """Kind of each copy, from `mtlnet.data.picture_copies.COPIES`."""
+    """Kind of copy of each picture, from `mtlnet.data.picture_copies.COPIES`."""
     hashes: tuple[str, ...]
     """SHA-256 of each picture's file."""
     camera: CameraParameters
@@ -83,8 +83,11 @@ class CustomImages:
         return np.take(self.images, indices, axis=0, out=out)
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, K; columns: `split_outputs`) with distances converted to metres at
-        the pictures' own cameras."""
+        """A model's outputs (N, K) for the N pictures, with distances converted from metres at the
+        model's camera to metres at the pictures' own cameras.
+
+        `mtlnet.inference.prediction.split_outputs` explains the K columns.
+        """
         found = outputs.copy()
         for lens in {lens for lens in self.lenses if lens is not None}:
             rows = [i for i, each in enumerate(self.lenses) if each == lens]
@@ -95,8 +98,8 @@ class CustomImages:
     def for_training(self) -> "CustomImages":
         """The same pictures with labels converted to metres at the model's camera.
 
-        Raises UserError with the line of a label that is then outside the range of the network's
-        coding.
+        Raises UserError with the line of the file if a converted label is outside the range of the
+        network's coding.
         """
         distances = self.labels.distances.copy()
         for row, lens in enumerate(self.lenses):
@@ -171,7 +174,8 @@ def _read_pictures(
     copies: Sequence[str],
     skip_refused: bool,
 ) -> Iterator[tuple[str, list[NDArray[np.uint8] | ImageError]]]:
-    """Yields, for each picture, the SHA-256 of its file and its copies as seen by `camera`."""
+    """Yields, for each picture, the SHA-256 of its file and its copies as seen by `camera`; an
+    ImageError stands for a copy that shows too little of the view of `camera`."""
 
     def read(row: int) -> tuple[str, list[NDArray[np.uint8] | ImageError]]:
         file = folder / pictures[row].file
@@ -193,8 +197,8 @@ def _read_pictures(
 def picture_cameras(
     folder: Path, pictures: Sequence[LabelledPicture], model: CameraParameters
 ) -> list[CameraParameters | None]:
-    """Camera of each picture; None: the model's camera. Raises UserError for a faulty camera
-    file."""
+    """Camera of each picture; None stands for the model's camera. Raises UserError for a faulty
+    camera file."""
     known: dict[str, CameraParameters] = {}
     found: list[CameraParameters | None] = []
     for picture in pictures:
@@ -246,8 +250,11 @@ def _prepared(
     target: CameraParameters,
     copy: str,
 ) -> NDArray[np.uint8] | ImageError:
-    """One copy of a picture as seen by the model's camera; an ImageError if it shows too little of
-    it."""
+    """One copy of a picture as seen by the model's camera `target`.
+
+    Returns an ImageError for a copy that shows too little of that camera's view; raises all other
+    errors.
+    """
     if copy != PLAIN:
         image = copied_picture(image, source or target, copy)
     if source is None:

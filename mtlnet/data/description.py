@@ -1,4 +1,4 @@
-"""The description of training data in a model's card, and the mean of its labels: the baseline."""
+"""Describes training data for a model's card; the mean labels are the baseline of evaluations."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ def describe_data(
 ) -> dict[str, Any]:
     """Description of a model's training data, for its model card.
 
-    The entry `mean` has the mean labels. Evaluations compare the model with a constant prediction
-    of them, the baseline. `held_out`: rounds on which only the uncertainty head was fitted. Their
-    seeds and tracks count as seen by the model, but the entry `frames` does not count their frames.
+    The entry `mean` has the mean labels; evaluations compare the model with the constant answer
+    `mean`. `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks
+    count as seen by the model, but the entry `frames` does not count their frames.
     The format of the entries `split`, `held_out` and `seeds` is defined in
     `mtlnet.inference.trained_rounds`.
     """
@@ -42,8 +42,10 @@ def describe_data(
 
 
 def mean_labels(labels: LabelArrays) -> dict[str, Any]:
-    """Means of the labels, and their most frequent class; None for markings that are never
-    present."""
+    """Means of the labels in m and rad, their most frequent class, and the share of each class.
+
+    The mean of a marking that is never present is None.
+    """
     distances = nan_where_unknown(labels.distances.astype(np.float64))
     counts = (~np.isnan(distances)).sum(0)
     sums = np.nansum(distances, axis=0)
@@ -60,6 +62,6 @@ def mean_labels(labels: LabelArrays) -> dict[str, Any]:
 
 
 def nan_where_unknown(metres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`metres` with NaN in place of infinity, which marks an unknown label
+    """`metres` with NaN in place of infinity, which stands for an unknown label
     (`trackfeatures.coding`)."""
     return np.where(np.isinf(metres), np.nan, metres)

@@ -1,7 +1,7 @@
-"""A dataset in GPU memory: images are decoded once, and each batch indexes into them.
+"""Keeps a dataset in GPU memory: images are decoded once, and each batch is selected from them.
 
-The batches are the same as the loader's (`mtlnet.data.loader`), in the same order. A training step
-of the paper's network takes about one millisecond on a data-centre GPU, less than decoding or
+The batches have the frames of the loader's batches (`mtlnet.data.loader`), in the same order. A
+training step of the paper's network takes about 1 ms on a data-centre GPU, less than decoding or
 augmenting 32 images on the CPU.
 """
 
@@ -27,8 +27,8 @@ PREFETCH = 4  # batches whose labels are computed in advance
 
 @dataclass(frozen=True)
 class DeviceBatch:
-    """A batch on the device: `images` uint8 (B, H, W, 3), `coded` (B, 6), `heading` (B,), and
-    `ahead` (B, A), as in `mtlnet.data.loader.Batch`."""
+    """A batch on the device: `images` uint8 (B, H, W, 3), coded targets `coded` (B, 6), classes
+    `heading` (B,), and labels of the road ahead `ahead` (B, A)."""
 
     images: Tensor
     coded: Tensor
@@ -105,7 +105,7 @@ def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
         return loader.frames.read_batch(rows, np.empty((len(rows), *size), np.uint8))
 
     firsts = range(0, number, CHUNK)
-    # Two chunks at a time: all cores stay busy while one chunk ends.
+    # Two chunks are decoded at a time, so that all cores stay busy while one chunk ends.
     chunks = make_ahead(decode, 0, DECODED_AHEAD, 2)
     for first, chunk in zip(firsts, chunks, strict=False):
         images[first : first + len(chunk)] = torch.from_numpy(chunk[:, first_row:])
@@ -116,10 +116,10 @@ def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
 def cache_if_it_fits(
     loader: Loader, device: torch.device, free_bytes: int | None = None, first_row: int = 0
 ) -> Loader | GpuDataset:
-    """The loader's frames, rows from `first_row` on, in the memory of `device` if they fit.
+    """The loader's frames, image rows from `first_row` on, in the memory of `device`.
 
-    Returns the loader itself if they do not fit, or on a CPU. `free_bytes`: free memory of the
-    device; None: the amount that the device reports.
+    Returns the loader itself if the frames do not fit, or if `device` is a CPU. `free_bytes`: free
+    memory of the device; None: the amount that the device reports.
     """
     if free_bytes is None:
         free_bytes = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0

@@ -1,10 +1,10 @@
-"""`labels.csv`: labels of a user's own pictures, one row per picture.
+"""Reads and writes `labels.csv`, the labels of a user's own pictures, with one row per picture.
 
-Columns, named in a header, in any order: `file`, a path relative to the folder; `ml`, `mr`, `l`,
-`m`, `r`, distances in m, negative to the left, empty where there is no marking; `angle`, rad,
+A header names the columns, in any order: `file`, a path relative to the folder; `ml`, `mr`, `l`,
+`m`, `r`, distances in m, negative to the left, empty where the distance is absent; `angle`, rad,
 positive when the car points to the right of the track; `heading`, the class of the road: left,
-straight or right. `l`, `m`, `r` and `heading` may be `?` (unknown): they then have no loss and are
-not evaluated. Columns and cells of `OPTIONAL` may be missing.
+straight or right. `l`, `m`, `r` and `heading` can be `?` (unknown); an unknown label adds no loss
+and is not evaluated. Columns and cells of `OPTIONAL` can be missing.
 """
 
 import csv
@@ -36,7 +36,8 @@ MARKING_LIMITS_M = {
     "m": (-2.0, 2.75),
     "r": (1.5, 7.0),
 }
-"""Range of the network's coding; labels outside it would be clipped."""
+"""Allowed distances, m. The network's coding would clip a distance outside its range, and would
+read `m` as absent above 2.75 m."""
 ANGLE_LIMIT_RAD = 0.5
 ROAD_CLASSES = {kind.name.lower(): int(kind) for kind in tf.RoadClass}
 
@@ -62,15 +63,16 @@ class CustomLabels:
 
 @dataclass(frozen=True)
 class LabelledPicture:
-    """The columns of a row other than the label."""
+    """One row of the file without its labels."""
 
     line: int
     file: str
     """Path of the picture, relative to the folder."""
     drive: str = ""
-    """Name of the drive. Pictures of one drive are similar: they are weighted and held out
+    """Name of the drive. Pictures of one drive are similar, so they are weighted and held out
     together."""
     light: str = ""
+    """Name of the light or weather, by which evaluations group the pictures."""
     camera: str = ""
     """Camera file of this picture, relative to the folder; empty: the folder's camera."""
     pitch_deg: float | None = None
@@ -109,7 +111,10 @@ def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
 
 
 def read_cells(path: Path) -> list[tuple[int, Cells]]:
-    """Line number and stripped cells by column, for each row. Raises UserError as `read_labels`."""
+    """Line number and cells by column, without surrounding spaces, for each row.
+
+    Raises UserError for a wrong header, a row with missing or surplus cells, and a repeated file.
+    """
     found: list[tuple[int, Cells]] = []
     seen: dict[str, int] = {}
     with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
@@ -138,8 +143,7 @@ def read_cells(path: Path) -> list[tuple[int, Cells]]:
 
 
 def write_cells(path: Path, rows: list[Cells]) -> None:
-    """Replace a `labels.csv` by these rows, atomically; it is on the disk when the function
-    returns."""
+    """Replace a `labels.csv` by these rows, atomically; the file is synced to disk on return."""
     used = [name for name in OPTIONAL if any(row.get(name) for row in rows)]
     text = StringIO()
     writer = csv.DictWriter(text, (*COLUMNS, *used), restval="", lineterminator="\n")
@@ -265,11 +269,11 @@ def _number(name: str, text: str) -> float:
 
 
 def lane_cells(ml: float, mr: float) -> Cells:
-    """Cells of the five distances, from the two markings (m) of the car's lane.
+    """Cells of the five distances, from the distances (m) to the two markings of the car's lane.
 
-    The definitions of the features apply: `ml` and `mr` are present from 0.5 m to both markings on.
-    Over 1.2 m from both markings there is no `m`; otherwise `m` is the nearer marking, and the
-    markings beyond it are unknown.
+    As the features are defined, `ml` and `mr` are present at 0.5 m or more from both markings. At
+    more than 1.2 m from both there is no `m`; otherwise `m` is the nearer marking, and the marking
+    beyond it is unknown.
     """
     near = min(-ml, mr)
     in_lane = near >= tf.IN_LANE_MARGIN_M
@@ -282,8 +286,11 @@ def lane_cells(ml: float, mr: float) -> Cells:
 
 
 def lane_sides(metres: Mapping[str, float | None]) -> tuple[float, float] | None:
-    """`ml` and `mr` of distances by marking; where the car is too near to a marking, that marking
-    and the next. None without a lane."""
+    """Distances (left, right), m, to two neighbouring markings, from the distances by marking.
+
+    They are `ml` and `mr`; where these are absent, `m` and `r`; where `r` is absent too, `l` and
+    `m`. None if no pair is present.
+    """
     for pair in (("ml", "mr"), ("m", "r"), ("l", "m")):
         left, right = (metres[name] for name in pair)
         if left is not None and right is not None:

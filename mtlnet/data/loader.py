@@ -1,4 +1,4 @@
-"""Training batches, decoded and augmented on threads while the network computes.
+"""Makes training batches: decodes and augments images on threads while the network computes.
 
 A batch is a pure function of (seed, step), so a resumed run gets the same batches as an
 uninterrupted one.
@@ -37,7 +37,7 @@ Made = TypeVar("Made")
 
 
 class LabelArrays(Protocol):
-    """Labels for training, as in `datagen.recording.Labels`."""
+    """Interface of the labels for training, which `datagen.recording.Labels` has."""
 
     @property
     def distances(self) -> NDArray[np.float32]:
@@ -53,7 +53,7 @@ class LabelArrays(Protocol):
 
 
 class Images(Protocol):
-    """Labelled images, as `datagen.recording.Frames`."""
+    """Interface of labelled images, which `datagen.recording.Frames` has."""
 
     def __len__(self) -> int: ...
 
@@ -66,7 +66,7 @@ class Images(Protocol):
 
 
 class AheadLabels(Protocol):
-    """Labels of the road ahead, as `mtlnet.data.road_ahead.RoadAhead`."""
+    """Interface of `mtlnet.data.road_ahead.RoadAhead`: labels of the road ahead."""
 
     def labels(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
@@ -77,7 +77,8 @@ class AheadLabels(Protocol):
 
 @dataclass(frozen=True)
 class Batch:
-    """A batch: `images` uint8 (B, H, W, 3), `coded` (B, 6), `heading` (B,), `ahead` (B, A)."""
+    """A batch: `images` uint8 (B, H, W, 3), coded targets `coded` (B, 6), classes `heading` (B,),
+    `ahead` (B, A)."""
 
     images: NDArray[np.uint8]
     coded: NDArray[np.float32]
@@ -99,11 +100,11 @@ class BatchLabels:
 
 
 class Loader:
-    """Endless batches of `frames`, shuffled again in each epoch.
+    """Makes batches of `batch` images of `frames` without end, shuffled again in each epoch.
 
-    `part` (index, count): this process's part of each batch of `batch` images, if there are several
-    processes; all parts together are the batch of a single process. `repeats` (N,): how often each
-    frame occurs in an epoch; None: once.
+    `part`: index of this process and number of processes; each process makes its part of every
+    batch. `ahead`: labels of the road ahead; None: batches without them. `repeats` (N,): number of
+    times that each frame occurs in an epoch; None: once.
     """
 
     def __init__(
@@ -188,8 +189,8 @@ class Loader:
 def make_ahead(
     make: Callable[[int], Made], first: int, ahead: int, workers: int
 ) -> Generator[Made, None, None]:
-    """Yields make(first), make(first + 1), ... without end; threads keep `ahead` results in
-    advance."""
+    """Yields make(first), make(first + 1), ... without end. `workers` threads compute `ahead`
+    results in advance."""
     with ThreadPoolExecutor(workers, thread_name_prefix="loader") as pool:
         waiting = deque(pool.submit(make, first + i) for i in range(ahead))
         try:

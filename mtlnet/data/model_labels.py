@@ -1,10 +1,10 @@
-"""Labels and outputs for rounds whose camera is mounted at another position than the model's
-camera.
+"""Converts labels and outputs of rounds whose camera is mounted at another position than the
+model's camera.
 
 A picture does not show the height of its camera, so the network answers as if every picture were
-taken by the model's camera. It is therefore trained on the distances that a car with the model's
-camera would have on a road that looks the same. `Rectification.outputs` converts the answers back
-to metres of the actual car.
+taken by the model's camera. Therefore the network is trained on the distances that a car with the
+model's camera would have on a road that looks the same. `Rectification.outputs` converts the
+answers back to metres of the actual car.
 """
 
 from dataclasses import replace
@@ -24,8 +24,8 @@ from trackfeatures.measurement import LineOffsets
 def model_labels(frames: Frames) -> Labels:
     """Labels of `frames` in metres at the model's camera, `frames.camera`: the network's targets.
 
-    The limits of the in-lane and the on-marking system are applied there and not at the actual car,
-    so that the presence of a distance also follows from the picture alone.
+    The limits of the in-lane and the on-marking system are applied to these converted distances, so
+    that the presence of a distance also follows from the picture alone.
     """
     labels = frames.labels
     distances = labels.distances.copy()
@@ -37,8 +37,10 @@ def model_labels(frames: Frames) -> Labels:
 
 
 def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.float32]:
-    """A model's outputs (N, K; columns: `split_outputs`) for `frames`, converted to metres of the
-    recorded cars."""
+    """A model's outputs (N, K) for `frames`, converted to metres of the recorded cars.
+
+    `mtlnet.inference.prediction.split_outputs` explains the K columns.
+    """
     changed, of_round = outputs.copy(), frames.labels.round
     for number, info in moved_rounds(frames):
         rows = np.flatnonzero(of_round == number)
@@ -69,7 +71,7 @@ def _as_mounted(camera: CameraParameters, other: CameraParameters) -> bool:
 
 
 def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArray[np.float32]:
-    """Distances (N, 5) of a round's frames at `camera`, NaN where absent there."""
+    """Distances (N, 5) of a round's frames in m at the model's `camera`, NaN where absent."""
     rectification = round_rectification(info, camera)
     scale = 1 / rectification.scale
     # Distances are measured at the centre of gravity, not at the camera.
@@ -81,8 +83,8 @@ def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArra
 
 
 def _foot(labels: Labels, info: RoundInfo) -> NDArray[np.float64]:
-    """Offsets (N,), m, from the recorded position to the point at which distances were measured, to
-    the left: on a banked road, the foot of the centre of gravity."""
+    """Offsets (N,), m to the left, from the recorded position to the point at which the distances
+    were measured. On a banked road this point is the foot of the centre of gravity."""
     level = labels.to_middle.astype(np.float64)
     expected = _measured(level, info.lanes, info.lane_width_m, info.line_offsets)
     gaps = labels.distances - expected
@@ -95,7 +97,8 @@ def _foot(labels: Labels, info: RoundInfo) -> NDArray[np.float64]:
 def _measured(
     to_middle: NDArray[np.float64], lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> NDArray[np.float32]:
-    """Distances (N, 5) at offsets (N,) from the middle of a road, NaN where absent."""
+    """Distances (N, 5), m, NaN where absent, of cars at offsets `to_middle` (N,), m to the left,
+    from the middle of a road."""
     found = (tf.measure(y, 0.0, 0.0, 0.0, lanes, lane_width_m, offsets) for y in to_middle.tolist())
     rows = [[np.nan if d is None else d for d in each.distances.values()] for each in found]
     return np.array(rows, np.float32).reshape(-1, len(tf.MARKINGS))

@@ -1,8 +1,8 @@
-"""Copies of a labelled picture for evaluation: mirrored, or rotated about the vertical axis.
+"""Makes copies of a labelled picture for evaluation: mirrored, or rotated about the vertical axis.
 
 A few drives contain few angles and offsets, so a constant answer scores well on them. Copies widen
-the range of both. Mirroring is exact. A rotation about the camera's optical centre is an exact
-homography of the picture; areas that the picture does not show are grey.
+the range of angles and offsets. Mirroring is exact. A rotation about the camera's optical centre is
+an exact homography of the picture; areas that the picture does not show are grey.
 """
 
 from dataclasses import replace
@@ -27,8 +27,10 @@ KINDS = {"mirrored": (MIRRORED,), "turned": tuple(TURNS_RAD)}
 
 
 def parse_copies(text: str) -> tuple[str, ...]:
-    """Kinds of copies for `--copies mirrored,turned`, the picture itself first. Raises
-    UserError."""
+    """The kinds of copies that `text`, the value of `--copies`, names; `PLAIN` is always first.
+
+    Raises UserError for an unknown word.
+    """
     words = [word.strip() for word in text.split(",") if word.strip()]
     unknown = [word for word in words if word not in KINDS]
     if unknown:
@@ -58,8 +60,8 @@ def copied_camera(camera: CameraParameters, copy: str) -> CameraParameters:
 def copied_picture(
     image: NDArray[np.uint8], camera: CameraParameters, copy: str
 ) -> NDArray[np.uint8]:
-    """The copy of a picture (H, W, 3) taken by `camera`, at any size of the camera's aspect
-    ratio."""
+    """The copy of a picture (H, W, 3) taken by `camera`. The picture can have any size of the
+    camera's aspect ratio."""
     if copy == PLAIN:
         return image
     if copy == MIRRORED:
@@ -92,7 +94,7 @@ def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) ->
 def copied_label(
     labels: CustomLabels, row: int, camera: CameraParameters, copy: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Distances (1, 5), angle (1,) and class (1,) of the copy of picture `row`."""
+    """Distances (1, 5) in m, angle (1,) in rad and class (1,) of the copy of picture `row`."""
     one = labels.take([row])
     distances, angle, heading = one.distances, one.angle, one.heading
     if copy == MIRRORED:

@@ -1,11 +1,11 @@
-"""Labels of the road ahead from recorded rounds, for the auxiliary heads in training.
+"""Computes labels of the road ahead from recorded rounds, for the auxiliary heads in training
+(`mtlnet.model.auxiliary`).
 
-Columns: where the two markings of the car's lane cross the image rows `ROWS`, from the polylines
-recorded with every image; px from the upper left corner of the image. Curvature: of the road at
-`AHEAD_M` in front of the car, 1/m, positive to the left, from the labels of all frames of the same
-track. NaN where unknown: outside the image, or where no frame was recorded nearby.
-
-These labels are used only in training (`mtlnet.model.auxiliary`).
+The columns are the positions, in px from the left edge of the image, at which the two markings of
+the car's lane cross the image rows `ROWS`. They are computed from the polylines recorded with every
+image, and are NaN outside the image. The curvatures are those of the road at the distances
+`AHEAD_M` in front of the car, 1/m, positive to the left. They are read from the labels of all
+frames of the same track, and are NaN where no frame was recorded nearby.
 """
 
 from collections.abc import Sequence
@@ -35,15 +35,16 @@ from mtlnet.model.auxiliary import AHEAD_M, ROWS, SIDES
 from trackfeatures.camera import CameraParameters
 
 POINTS = 34
-"""Number of points of a polyline, one per metre, starting just behind the camera: the farthest of
-`ROWS` is 25 m ahead."""
+"""Number of points read from a polyline, which has one per metre and starts just behind the camera.
+The farthest of `ROWS` shows the road 25 m ahead."""
 NEAREST_M, APART_M = 12.0, 1.2
-"""Limits, m ahead and to the side, for the start of a polyline of this lane's markings."""
+"""A polyline belongs to a marking of the lane only if its start is at most `NEAREST_M` in front of
+the camera and at most `APART_M` to the side of the marking."""
 CHUNK = 20_000  # frames per task of a reading process
 KNOWN_M = 2.0
 """A curvature is known if a frame was recorded within this distance of the point."""
 
-HARD_CURVATURE = 1 / 80
+HARD_CURVATURE = 1 / 80  # 1/m; a frame with a larger curvature is hard
 HARD_NEAR_CHANGE_M = 8.0
 """Distance to a change of class within which a frame is hard: 80 % of a model's wrong classes lay
 within 8 m, 53 % within 4 m."""
@@ -115,7 +116,8 @@ class RoadAhead:
 
 
 def _annotations(path: Path) -> Messages:
-    """Annotations of a round's frames. Raises DatasetError unless each image has its annotation."""
+    """The annotations of a round's frames, in their order. Raises DatasetError unless each image
+    has its annotation."""
     found = open_round(path, (CAMERA, ANNOTATIONS)).messages
     if not np.array_equal(found[CAMERA].log_time, found[ANNOTATIONS].log_time):
         raise DatasetError(
@@ -141,10 +143,11 @@ def own_markings(
     camera: CameraParameters,
     out: NDArray[np.floating[Any]],
 ) -> None:
-    """Write the polylines of the lane's markings at `beside` (2,) m to `out` (2, POINTS, 2).
+    """Write the polylines (px) of the lane's two markings, found in `lines`, to `out` (2, POINTS,
+    2).
 
-    A polyline is assigned to a marking by its near end, as if the road were level there; lanes are
-    at least 2.7 m wide.
+    `beside` (2,): distances to the markings, m, negative to the left. A polyline is assigned to a
+    marking by its near end, as if the road were level there; lanes are at least 2.7 m wide.
     """
     nearest = np.full(SIDES, APART_M)
     drawn = [line for line in lines if len(line)]
@@ -163,7 +166,8 @@ def own_markings(
 def changed_points(
     points: NDArray[np.floating[Any]], params: AugmentParams, camera: CameraParameters
 ) -> NDArray[np.float64]:
-    """Points (B, 2, POINTS, 2) of images after augmentation with `params`."""
+    """Positions (B, 2, POINTS, 2), px, of `points` of the same shape in the images augmented with
+    `params`."""
     moved = points.astype(np.float64)
     below = np.maximum(moved[..., 1] - horizon_row(camera), 0.0)
     moved[..., 0] += params.shift[:, None, None] * shear_per_metre(camera) * below
@@ -239,10 +243,10 @@ def hard_frames(
     heading: NDArray[np.int64],
     tracks: NDArray[np.str_],
 ) -> NDArray[np.bool_]:
-    """Frames (N,) in sharp bends, or near a point where the class of the road changes.
+    """Mask (N,) of the frames in sharp bends, or near a point where the class of the road changes.
 
-    Most errors of a network occur there. `s` m, `curvature` 1/m and `heading` (N,) are the labels;
-    all frames of a track together give the points where its class changes.
+    Most errors of a network occur in these frames. `s` (N,) m, `curvature` (N,) 1/m and `heading`
+    (N,) are the labels; the points where the class changes are found from all frames of a track.
     """
     found = np.abs(curvature) > HARD_CURVATURE
     for track in np.unique(tracks).tolist():
@@ -260,7 +264,8 @@ def hard_frames(
 
 
 def hard_frame_repeats(frames: Images, repeats: int) -> NDArray[np.int64] | None:
-    """How often each frame of recorded rounds is drawn in an epoch; None: each once."""
+    """Number of times (N,) that each frame is used in an epoch: `repeats` for the hard frames of
+    recorded rounds, 1 for other frames. None: every frame once."""
     if repeats == 1 or not isinstance(frames, Frames):
         return None
     labels = frames.labels

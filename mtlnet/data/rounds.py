@@ -1,4 +1,4 @@
-"""Recorded rounds as training data: opening them, holding some out, finding undecodable frames."""
+"""Opens recorded rounds for training, holds some of them out, and finds undecodable frames."""
 
 import hashlib
 from contextlib import suppress
@@ -14,7 +14,7 @@ from trackfeatures.errors import UserError
 
 HELD_OUT_SHARE = 1 / 12
 MIN_ROUNDS_TO_HOLD_OUT = 8
-"""No round is held out if there are fewer train rounds."""
+"""Minimum number of train rounds; with fewer no round is held out."""
 CHUNK = 64  # images decoded at a time
 MAX_NAMED = 5  # undecodable images named in a message
 
@@ -39,11 +39,11 @@ def open_training_dataset(path: Path) -> Dataset:
 
 
 def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
-    """Divide the train rounds of a dataset into those to train on and those held out.
+    """Divide the train rounds of a dataset into rounds to train on and held-out rounds, on which
+    the uncertainty head is fitted. The latter are None if there are too few train rounds.
 
-    The held-out rounds are for fitting the uncertainty head. The division depends only on the set
-    of rounds; rounds whose track and lights are rare among the rounds held out so far are chosen
-    first.
+    The division depends only on the set of rounds. The next held-out round is always the one whose
+    track and lights are rarest among the rounds already held out.
     """
     rounds = [info for info in dataset.rounds if info.split == "train"]
     conditions = {info.id: {info.track, *info.lights} for info in rounds}
@@ -103,9 +103,9 @@ def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
 
 
 def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) -> None:
-    """Decode all frames; raise DatasetError with the number and names of the undecodable ones.
+    """Decode all frames; raise DatasetError with the number and names of undecodable frames.
 
-    `skippable`: whether the command has the option --skip-undecodable.
+    `skippable`: the command has the option --skip-undecodable, which the message then mentions.
     """
     found = list(find_undecodable(frames).values())
     if not found:
@@ -120,7 +120,7 @@ def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) ->
 
 
 def drop_undecodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
-    """`frames` without the undecodable frames, and the names of the undecodable frames.
+    """`frames` without the undecodable frames, and the names "ROUND/FRAME" of these frames.
 
     Raises DatasetError when no frame is left.
     """

@@ -1,12 +1,12 @@
-"""Augmentation by another camera pose: lateral shift and rotation, with their labels.
+"""Augments images and their labels by another camera pose: a lateral shift and a rotation.
 
-Lateral shift: when the camera moves left by s, a point at depth Z appears s f / Z px further right.
-On a flat road that is s / h px per row below the horizon, with h the height of the camera. So the
+When the camera moves left by s m, a point at depth Z m appears s f / Z px further right. On a flat
+road this shift is s / h px per row below the horizon, with h the height of the camera in m. So the
 image is sheared below the horizon and unchanged above it. This is correct for markings near the
 car; objects that stand on the road are sheared too.
 
-Rotation: exact for any scene except at the image border, because a rotation about the optical
-centre is a homography (Hartley and Zisserman 2004, section 8.4).
+A rotation about the optical centre is a homography of the image (Hartley and Zisserman 2004,
+section 8.4). It is exact for any scene, except at the image border.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from trackfeatures.camera import CameraParameters
 MAX_SHIFT_M = 0.6
 YAW_STD_RAD, PITCH_STD_RAD = 0.035, 0.006
 MAX_YAW_RAD = 0.09
-ROTATIONS = 64  # number of rotations, whose maps are computed once; number 0 is none
+ROTATIONS = 64  # number of rotations, whose maps are computed once; number 0 is no rotation
 
 
 def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: float) -> None:
@@ -46,17 +46,18 @@ def horizon_row(camera: CameraParameters) -> float:
 
 
 def shear_per_metre(camera: CameraParameters) -> float:
-    """Shift of a row to the right, px per row below the horizon and per metre to the left."""
+    """Shift of an image row to the right, px, for each row that it is below the horizon and each
+    metre that the camera moves to the left."""
     return float(np.cos(np.radians(camera.pitch_deg)) / camera.height_above_road_m)
 
 
 def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Limits (N, 2) of a shift to the right (negative) and to the left, m, within which labels stay
-    known.
+    """Limits (N, 2), m, of a shift to the right (negative) and to the left, within which the labels
+    after the shift can be computed.
 
-    `distances` (N, 5) in m, NaN where absent. Beyond a limit another marking would be measured,
-    whose distance or presence is not known. A marking with an unknown label sets no limit within a
-    lane and allows no shift elsewhere.
+    `distances` (N, 5) in m, NaN where absent, infinity where the label is unknown. Beyond a limit
+    another marking would be measured, whose distance or presence is not labelled. A marking with an
+    unknown label sets no limit for a car in its lane; elsewhere it allows no shift.
     """
     unknown = np.isinf(distances)
     ml, mr, l, m, r = np.where(unknown, np.nan, distances).astype(np.float64).T
@@ -89,7 +90,7 @@ def lateral_shift_m(
 def rotations() -> NDArray[np.float64]:
     """All rotations (ROTATIONS, 2): yaw to the left and pitch downwards, rad; number 0 is none."""
     rng = np.random.default_rng(0)
-    # Quantiles of the normal distribution rather than draws: few values represent it well.
+    # Quantiles, because so few random values would represent the normal distribution badly.
     quantiles = (np.arange(1, ROTATIONS) - 0.5) / (ROTATIONS - 1)
     yaw = [NormalDist(0.0, YAW_STD_RAD).inv_cdf(quantile) for quantile in quantiles]
     angles = np.column_stack([yaw, rng.normal(0.0, PITCH_STD_RAD, ROTATIONS - 1)])
@@ -108,7 +109,8 @@ def rotate(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> N
 def rotation_maps(
     camera: CameraParameters, number: int
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Source pixel of each pixel of a rotated image, as fixed-point maps of OpenCV."""
+    """Source pixel of each pixel of an image rotated by rotation `number`, as the fixed-point maps
+    (H, W, 2) and (H, W) of cv2.remap."""
     inverse = np.linalg.inv(rotation_homography(camera, *rotations()[number].tolist()))
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y, scale = np.tensordot(inverse, np.stack([columns, rows, np.ones_like(rows)]), 1)
@@ -120,8 +122,8 @@ def rotation_maps(
 def rotation_homography(
     camera: CameraParameters, yaw: float, pitch: float = 0.0
 ) -> NDArray[np.float64]:
-    """Homography (3, 3) of pixels for a car rotated left by `yaw` and a camera tilted down by
-    `pitch`."""
+    """Homography (3, 3) from the pixels of an image to its pixels after the car is rotated left by
+    `yaw` and the camera is tilted down by `pitch`, rad."""
     return camera.homography(
         replace(
             camera,
@@ -137,9 +139,10 @@ def rotate_labels(
     yaw: NDArray[np.float64],
     camera: CameraParameters,
 ) -> NDArray[np.float32]:
-    """Coded targets (B, 6) after the car rotated left by `yaw` (B,) about its camera.
+    """Coded targets (B, 6) after the car is rotated left by `yaw` (B,) rad about its camera.
 
-    The centre of gravity, `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
+    `distances` (B, 5) in m and `angle` (B,) in rad are the labels before. The centre of gravity,
+    `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
     """
     shift = -camera.x * np.sin(yaw)
     return tf.encode(distances + shift[:, None], angle - yaw)

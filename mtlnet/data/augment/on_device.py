@@ -1,8 +1,9 @@
-"""The augmentation of `mtlnet.data.augment.pipeline` in torch, on a whole batch, for a GPU.
+"""Augments the images of a whole batch in torch, on a GPU.
 
-The parameters and labels are the same. Differences: shift, rotation and mirroring are one
-resampling, so that each pixel is interpolated once; pixel values are rounded once, at the end;
-noise is drawn anew; there is no JPEG compression.
+Parameters and labels are the same as on the CPU (`mtlnet.data.augment.pipeline`). The images differ
+as follows: shift, rotation and mirroring are one resampling, so that each pixel is interpolated
+once; pixel values are rounded once, at the end; the noise is new for each image instead of stored;
+there is no JPEG compression.
 """
 
 from functools import lru_cache
@@ -31,8 +32,8 @@ BLUR_RADIUS = 3
 def to_device(values: NDArray[Any], device: torch.device) -> Tensor:
     """The array as a tensor on `device`.
 
-    It is copied to a GPU from pinned memory. A copy from other memory may wait for the kernels in
-    the queue, and the GPU would then idle while the next batch is made.
+    It is copied to a GPU from pinned memory. A copy from pageable memory can wait for the kernels
+    in the queue, and the GPU would then idle while the next batch is made.
     """
     tensor = torch.from_numpy(values)
     if device.type == "cuda":
@@ -90,7 +91,8 @@ class DeviceAugment:
             [2 * u / (width - 1) - 1, 2 * (v - self._first_row) / (height - 1) - 1], 3
         )
         moved = grid_sample(x, grid, "bilinear", "reflection", align_corners=True)
-        # The area that comes into view is filled without markings: mirrored ones would bend back.
+        # The area that a shift brings into view gets the colour of the road, because mirrored
+        # markings would bend back.
         bare = x[:, :, -1].mean(2)[:, :, None, None]
         beside = (metres != 0) & ((u < -0.5) | (u > width - 0.5))
         return torch.where(beside[:, None], bare, moved)

@@ -1,4 +1,4 @@
-"""Augmentation of colour and image quality: colour, blur, noise, JPEG artefacts.
+"""Augments the colour and quality of images: colour, blur, noise, JPEG artefacts.
 
 Images are uint8 RGB (H, W, 3), changed in place with OpenCV. The operations are the same as in
 torchvision.transforms.v2, which takes 3 to 30 times as long;
@@ -13,16 +13,16 @@ import simplejpeg
 from numpy.typing import NDArray
 
 BRIGHTNESS, CONTRAST, SATURATION = 0.12, 0.15, 0.2
-CHANNEL_BRIGHTNESS, CHANNEL_CONTRAST = 0.04, 0.06  # drawn for each channel
+CHANNEL_BRIGHTNESS, CHANNEL_CONTRAST = 0.04, 0.06  # additional change of each channel
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 STORED_NOISE_STD = 32.0  # standard deviation of the stored noise; its mean is 128
 
 
 def draw_colour_transforms(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Random affine colour transforms (B, 3, 4), from (r, g, b, 1) to (r, g, b), 0 to 255.
+    """Random affine colour transforms (`count`, 3, 4), from (r, g, b, 1) to (r, g, b), 0 to 255.
 
-    In order: saturation; contrast about middle grey and brightness, for all channels and per
-    channel.
+    They change the saturation, then the contrast about middle grey and the brightness. Contrast and
+    brightness have a change of all channels and one of each channel.
     """
     saturation = 1.0 + rng.uniform(-SATURATION, SATURATION, (count, 1, 1))
     mixed = saturation * np.eye(3) + (1.0 - saturation) * np.array(LUMA)
@@ -43,8 +43,8 @@ def blur(image: NDArray[np.uint8], std_px: float) -> None:
 
 
 def add_noise(image: NDArray[np.uint8], std: float, start: int) -> None:
-    """Add stored normal noise, starting at index `start`, with standard deviation `std` (0 to
-    255)."""
+    """Add normal noise with standard deviation `std`, in levels of 0 to 255. The noise is read from
+    the stored noise, starting at index `start`."""
     noise = stored_noise(2 * image.size)[start : start + image.size].reshape(image.shape)
     weight = std / STORED_NOISE_STD
     cv2.addWeighted(image, 1.0, noise, weight, -128.0 * weight, dst=image)
@@ -52,8 +52,8 @@ def add_noise(image: NDArray[np.uint8], std: float, start: int) -> None:
 
 @lru_cache(maxsize=2)
 def stored_noise(size: int) -> NDArray[np.uint8]:
-    """Normal noise (size,) about 128, stored because drawing it per image would dominate the
-    time."""
+    """Normal noise (size,) with mean 128 and standard deviation `STORED_NOISE_STD`. It is stored,
+    because new noise for each image would take most of the time."""
     drawn = np.random.default_rng(0).standard_normal(size, np.float32)
     return (128 + STORED_NOISE_STD * drawn).round().clip(0, 255).astype(np.uint8)
 

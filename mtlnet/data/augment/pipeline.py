@@ -1,8 +1,8 @@
-"""Augmentation of a batch: draw the parameters, apply them to images, change the labels.
+"""Augments a batch: makes random parameters, applies them to the images, changes the labels.
 
-The parameters of a whole batch are drawn from one generator before any image is changed. A process
-that makes only a part of the batch therefore changes its images like a process that makes all.
-Images are uint8 (H, W, 3), changed in place.
+One random generator gives the parameters of a whole batch before any image is changed. Therefore a
+process that makes only a part of the batch changes its images like a process that makes the whole
+batch. Images are uint8 (H, W, 3), changed in place.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -33,9 +33,9 @@ BORDER_SHARE = 0.5
 MAX_BORDER = (0.3, 0.3, 0.25, 0.25)
 """Maximum shares of rows and columns without a picture at the top, bottom, left and right."""
 NARROW_SHARE = 0.15
-"""Share of images with the border of the narrowest lens that the model still answers for."""
+"""Share of images with borders like those of the narrowest field of view that is not refused."""
 LOWEST_EDGE = 0.55
-"""Least share of the rows above the lower border of such an image, so that it shows some road."""
+"""Minimum share of the rows above the lower border of these images, so that they show some road."""
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
@@ -44,14 +44,14 @@ BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 class AugmentParams:
     """Augmentation parameters of B images; 0 leaves an image unchanged."""
 
-    shift: NDArray[np.float64]  # (B,) m to the left; before `resolve_lateral_shift` a share
+    shift: NDArray[np.float64]  # (B,) m to the left; until `resolve_lateral_shift` a share
     rotation: NDArray[np.int64]  # (B,) number of one of `ROTATIONS`
     mirrored: NDArray[np.bool_]  # (B,)
     shadow: NDArray[np.int64]  # (B,) number of one of `SHADOWS`
     patch: NDArray[np.int64]  # (B, 7): top, left, rows, columns, r, g, b
     colour: NDArray[np.float32]  # (B, 3, 4): affine colour transform
     blur_std: NDArray[np.float64]  # (B,) px
-    noise_std: NDArray[np.float64]  # (B,) of 255
+    noise_std: NDArray[np.float64]  # (B,) in levels of 0 to 255
     noise_start: NDArray[np.int64]  # (B,) index in the stored noise
     jpeg_quality: NDArray[np.int64]  # (B,)
     border: NDArray[np.int64]  # (B, 4) px without a picture at the top, bottom, left, right
@@ -62,7 +62,7 @@ class AugmentParams:
 
 
 def draw_params(count: int, height: int, width: int, rng: np.random.Generator) -> AugmentParams:
-    """Draw the parameters of a batch; call `resolve_lateral_shift` before applying them."""
+    """Random parameters of `count` images; call `resolve_lateral_shift` before applying them."""
     return AugmentParams(
         shift=rng.uniform(-1.0, 1.0, count) * (rng.random(count) < SHIFT_SHARE),
         rotation=rng.integers(1, ROTATIONS, count) * (rng.random(count) < ROTATION_SHARE),
@@ -90,7 +90,8 @@ def _draw_patch(count: int, height: int, width: int, rng: np.random.Generator) -
 def _draw_border(
     count: int, height: int, width: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Borders (B, 4), px, outside the field of view of a narrower camera."""
+    """Random borders (B, 4), px at the top, bottom, left and right, like the areas that a camera
+    with a narrower field of view does not show."""
     share = rng.uniform(0.0, MAX_BORDER, (count, 4)) * (rng.random((count, 1)) < BORDER_SHARE)
     shown = rng.uniform(LEAST_SHOWN, 1.0, (count, 2))  # of rows and columns
     first = np.column_stack([np.maximum(LOWEST_EDGE - shown[:, 0], 0.0), np.zeros(count)])
@@ -101,7 +102,7 @@ def _draw_border(
 
 
 def resolve_lateral_shift(params: AugmentParams, distances: NDArray[np.float32]) -> AugmentParams:
-    """The parameters with shifts in m, for frames with distances (B, 5)."""
+    """`params` with shifts in m instead of shares, for frames with `distances` (B, 5) in m."""
     return replace(params, shift=lateral_shift_m(params.shift, distances))
 
 
@@ -131,7 +132,7 @@ def apply_params(
 
 
 def _clear_border(image: NDArray[np.uint8], border: list[int]) -> None:
-    """Fill the border (top, bottom, left, right; px) of an image, in place."""
+    """Fill the border (top, bottom, left, right; px) of an image with grey, in place."""
     top, bottom, left, right = border
     image[:top] = BORDER_LEVEL
     image[image.shape[0] - bottom :] = BORDER_LEVEL
@@ -146,7 +147,10 @@ def augment_labels(
     params: AugmentParams,
     camera: CameraParameters,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Coded targets (B, 6) and classes (B,) of the augmented images."""
+    """Coded targets (B, 6) and classes (B,) of the augmented images.
+
+    `distances` (B, 5) in m, `angle` (B,) in rad and `heading` (B,) are the labels of the frames.
+    """
     shift = (params.shift * np.cos(angle)).astype(np.float32)
     yaw = rotations()[params.rotation, 0]
     coded = rotate_labels(distances + shift[:, None], angle, yaw, camera)

@@ -1,4 +1,4 @@
-"""Augmentation by shadows of trees on the road; each shadow is drawn once and reused.
+"""Augments images by shadows of trees on the road; each shadow is computed once and reused.
 
 A network trained on few shaded road sections mistakes the edges of shadows for markings.
 """
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from trackfeatures.camera import CameraParameters
 
-SHADOWS = 64  # number of shadows; number 0 is none
+SHADOWS = 64  # number of shadows; number 0 is no shadow
 DARKNESS = (0.3, 0.75)  # share of the light that a shadow removes
 COVERED = (0.15, 0.7)  # share of the road that is shaded
 CELL_M = 0.08  # size of a cell of the noise field from which shadows are cut
 LEAF_CELLS, CROWN_CELLS = 3.0, 14.0  # standard deviations of the blur: leaves, crowns
-MAX_DISTANCE_M = 40.0  # beyond it a shadow is uniform
+MAX_DISTANCE_M = 40.0  # beyond this distance from the camera a shadow is uniform
 FIELD = 1024  # cells per side
 
 
@@ -28,13 +28,14 @@ def add_shadow(image: NDArray[np.uint8], camera: CameraParameters, number: int) 
 
 
 def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
-    """Remaining light (SHADOWS, H, W, 3) of all shadows; 255 where there is no shadow."""
+    """Remaining light (SHADOWS, H, W, 3), 0 to 255, in all shadows; 255 outside a shadow."""
     return np.stack([shadow_mask(camera, number) for number in range(SHADOWS)])
 
 
 @lru_cache(maxsize=2 * SHADOWS)
 def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
-    """Remaining light (H, W, 3) of one shadow, computed on first use (all shadows take 6 s)."""
+    """Remaining light (H, W, 3), 0 to 255, in shadow `number`, computed at the first use (all
+    shadows together take 6 s)."""
     if number == 0:
         return np.full((camera.height, camera.width, 3), 255, np.uint8)
     rng = np.random.default_rng()
@@ -55,14 +56,15 @@ def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=2)
 def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The point of a flat road in each pixel, two arrays (H, W): m ahead and m left of the camera.
+    """The point of a flat road in each pixel, as two arrays (H, W): m ahead and m left of the
+    camera.
 
     Pixels above the horizon or far away are more than `MAX_DISTANCE_M` ahead.
     """
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     ahead, left = (camera.road_points(pixels) - (camera.x, camera.y)).T
-    near = ahead < 2 * MAX_DISTANCE_M  # not NaN
+    near = ahead < 2 * MAX_DISTANCE_M  # false for NaN
     ahead, left = np.where(near, ahead, 2 * MAX_DISTANCE_M), np.where(near, left, 0.0)
     shape = rows.shape
     return ahead.reshape(shape), left.reshape(shape)
@@ -74,11 +76,11 @@ class Drawn:
 
     noise: NDArray[np.float32]  # (FIELD, FIELD)
     leaves: float  # weight of the leaves; the crowns have a weight of 1
-    covered: float  # one of `COVERED`
+    covered: float  # within `COVERED`
     rotation: float  # rad, of the field on the road
     u: float  # cells, the camera's position in the field
     v: float
-    darkness: float  # one of `DARKNESS`
+    darkness: float  # within `DARKNESS`
 
 
 def _draw(rng: np.random.Generator) -> Drawn:
@@ -90,7 +92,7 @@ def _draw(rng: np.random.Generator) -> Drawn:
 
 @lru_cache(maxsize=SHADOWS)
 def _state_before(number: int) -> Any:
-    """State of the generator after the shadows before `number`; one generator draws all shadows."""
+    """State of the generator before shadow `number`; one generator is used for all shadows."""
     rng = np.random.default_rng(0)
     if number > 1:
         rng.bit_generator.state = _state_before(number - 1)
