@@ -1,1 +1,2 @@
-"""Sources of images: files, folders, films, recorded rounds, other recordings, webcams, streams."""
+"""Reads images from files, folders, films, recorded rounds, recordings of other programs, webcams
+and streams."""

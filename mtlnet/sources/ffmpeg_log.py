@@ -1,7 +1,7 @@
 """Collects the errors that FFmpeg reports while OpenCV decodes a film.
 
-OpenCV hides decoding errors: frames that FFmpeg has patched look like intact frames. They are
-reported only in FFmpeg's log, which by default goes to stderr.
+OpenCV hides decoding errors: frames that FFmpeg has patched look like intact frames. FFmpeg reports
+the errors only in its log, which by default goes to stderr.
 """
 
 import atexit
@@ -15,8 +15,8 @@ from pathlib import Path
 
 AV_LOG_ERROR = 16
 LINE_BYTES = 512
-# Messages about data other than pictures, which dash cameras write freely, and about the end of a
-# stream of unknown size.
+# Words of messages that do not concern pictures: dash cameras write much other data, and FFmpeg
+# reports the end of a stream of unknown size.
 HARMLESS = ("SEI", "APP fields", "timescale not set", f"should be {2**64 - 1}")
 SIZES = (b"Reinit context to %dx%d", b"sof0: picture: %dx%d")
 SIZE = re.compile(r"(?:to|picture:) (\d+)x(\d+)")
@@ -30,11 +30,11 @@ LogCallback = ctypes.CFUNCTYPE(
 
 @dataclass
 class DecodingErrors:
-    """Number of errors so far, and the text of the first.
+    """The errors that FFmpeg has reported: their number `count` and the text `first` of the first.
 
     `unconverted`: text of an error in the conversion to RGB, after which OpenCV returns a black
     picture. `size`: coded size (width, height) of later pictures, if a decoder of H.264 or MJPEG
-    reports one; OpenCV scales these pictures to the size of the first.
+    reports one; OpenCV scales these pictures to the size of the first picture.
     """
 
     count: int = 0
@@ -47,10 +47,11 @@ class DecodingErrors:
         self.count, self.first, self.unconverted, self.size = 0, "", "", None
 
     def new_size(self, shape: tuple[int, ...]) -> tuple[int, int] | None:
-        """The new size (width, height) of pictures if it changed; `shape` (H, W, 3) is the first
-        picture's.
+        """The new size (width, height) of the pictures if it differs from `shape` (H, W, 3) of the
+        first picture, else None.
 
-        A coded size is a multiple of `BLOCK_PX`; the size of a rotated film is rotated.
+        A coded size is rounded up to a multiple of `BLOCK_PX`; width and height of a rotated film
+        are exchanged.
         """
         if self.size is None:
             return None
@@ -75,7 +76,7 @@ class DecodingErrors:
 def decoding_errors() -> Iterator[DecodingErrors]:
     """Collect the errors of all films that are decoded within the context.
 
-    None are collected where FFmpeg's library is not found.
+    If FFmpeg's library is not found, no errors are collected.
     """
     found = DecodingErrors()
     library = _library()
@@ -113,7 +114,7 @@ def _restore() -> None:
 
 @lru_cache(maxsize=1)
 def _library() -> ctypes.CDLL | None:
-    """The libavutil that OpenCV has loaded; None if there is none."""
+    """The library libavutil of FFmpeg that OpenCV has loaded; None if it is not found."""
     import cv2  # noqa: F401  # loads it
 
     try:

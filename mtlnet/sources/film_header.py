@@ -22,7 +22,8 @@ PROJECTION, YAW, PITCH = 0x7670, 0x7673, 0x7674  # a mirrored picture has a yaw 
 ASF_HEADER = bytes.fromhex("3026b2758e66cf11a6d900aa0062ce6c")
 ASF_PROPERTIES = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")
 Y4M, Y4M_FRAME, Y4M_LINE_BYTES = b"YUV4MPEG2", b"FRAME\n", 1024
-Y4M_CHROMA = {b"420": (2, 2), b"411": (4, 1), b"422": (2, 1), b"444": (1, 1)}  # pixels a sample
+# Pixels per chroma sample, across and down.
+Y4M_CHROMA = {b"420": (2, 2), b"411": (4, 1), b"422": (2, 1), b"444": (1, 1)}
 OGG_PAGE, OGG_LAST, OGG_TAIL_BYTES = b"OggS", 4, 1 << 17
 MP4_FIRST = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"styp")
 
@@ -65,10 +66,11 @@ def unsupported_picture(path: Path) -> str:
 
 
 def stated_frames(path: Path, counted: int) -> int:
-    """Number of frames in the index of an AVI, without empty ones; `counted` for a Y4M, whose size
-    gives it; 0 where unknown.
+    """The exact number of frames that a film must have; 0 if its container does not state it.
 
-    In other containers the number is an estimate, and the decoder reports missing frames.
+    For an AVI it is the number of frames in the index, without empty frames. For a Y4M it is
+    `counted`, OpenCV's number, which is computed from the file's size. Other containers state only
+    an estimate; there the decoder reports missing frames.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -183,9 +185,9 @@ def _float(file: BinaryIO, start: int, end: int) -> float:
 def _elements(
     file: BinaryIO, start: int, end: int, last: int | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Id, start and end of the content of each EBML element; `last`: id after which to stop.
+    """Yields id, start and end of the content of each EBML element between bytes `start` and `end`.
 
-    An element of unknown size ends at the latest possible place.
+    `last`: id of the element after which to stop. An element of unknown size extends to `end`.
     """
     while start < end:
         file.seek(start)
@@ -208,7 +210,7 @@ def _elements(
 
 
 def _chunks(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Type, start and end of the content of each RIFF chunk."""
+    """Yields type, start and end of the content of each RIFF chunk between the given bytes."""
     while start + 8 <= end:
         file.seek(start)
         kind, size = struct.unpack("<4sI", file.read(8))
@@ -235,8 +237,8 @@ def _missing_in_ogg(file: BinaryIO, size: int) -> str:
 
 
 def _missing_in_y4m(file: BinaryIO, size: int) -> str:
-    """What is missing at the end of a Y4M whose frames have no parameters, as all writers make
-    them."""
+    """A text about what is missing at the end of a Y4M file; empty if nothing is missing. The
+    frames must have no parameters; no writer adds any."""
     file.seek(0)
     fields = file.readline(Y4M_LINE_BYTES).split()
     start = file.tell()
@@ -254,7 +256,7 @@ def _missing_in_y4m(file: BinaryIO, size: int) -> str:
 
 
 def _asf_size(file: BinaryIO) -> int:
-    """Size of the file in the header of an ASF; 0 for a broadcast."""
+    """Size of the file, bytes, in the header of an ASF file; 0 for a broadcast."""
     file.seek(0)
     header = file.read(1 << 16)
     at = header.find(ASF_PROPERTIES)

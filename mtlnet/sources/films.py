@@ -1,9 +1,9 @@
-"""Reads the frames of a film with OpenCV's FFmpeg, as its header says they must be shown.
+"""Reads the frames of a film with OpenCV's FFmpeg, in the form in which a player shows them.
 
-They are rotated (quarter turns) and get square pixels; FFmpeg itself applies the range and matrix
-of the colours and omits frames before the start (edit lists). The number of frames in a header is
-an estimate: a film ends where FFmpeg finds no more. It has a fault if it breaks off or FFmpeg
-reports an error.
+The frames are rotated by quarter turns and scaled to square pixels if the header requires it;
+FFmpeg itself applies the range and matrix of the colours and omits frames before the start (edit
+lists). The number of frames in a header is an estimate: a film ends where FFmpeg finds no more. A
+film has a fault if it breaks off or FFmpeg reports an error.
 """
 
 import os
@@ -30,8 +30,8 @@ CONVERT = "convert it, e.g. with `ffmpeg -i FILM -c:v libx264 new.mp4`"
 
 @dataclass(frozen=True)
 class FilmHeader:
-    """`count`: estimated number of frames, 0 if unknown; `fps`: frames per second, 0 if not
-    stated."""
+    """Header of a film. `count`: estimated number of frames, 0 if unknown; `fps`: frames per
+    second, 0 if not stated."""
 
     count: int
     fps: float
@@ -49,16 +49,17 @@ def read_film_header(path: Path) -> FilmHeader:
 
 @dataclass
 class Film:
-    """A film being read. `fault`, set after the last frame, is a text about the film's fault; empty
-    if it has none."""
+    """A film whose frames can be read. `fault`, set after the last frame, describes the film's
+    fault; empty if it has none."""
 
     path: Path
     fault: str = ""
 
     def pictures(self) -> Iterator[Picture]:
-        """Yields its frames, numbered from 0.
+        """Yields the frames of the film, numbered from 0.
 
-        A frame that cannot be decoded is skipped, but counted. Raises as `read_film_header`.
+        A frame that cannot be decoded is skipped, but counted. Raises UserError for a file that is
+        not a film, OSError for an unreadable file.
         """
         with decoding_errors() as errors:
             film = _open(self.path, errors)
@@ -117,10 +118,10 @@ class Film:
 
 
 def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
-    """The opened film at `path`, of any name: OpenCV gets the path of an open file descriptor.
+    """The opened film at `path`. Raises UserError when it cannot be opened or shown as stored.
 
-    With a name that is not UTF-8 OpenCV would end the process, and FFmpeg takes a name with a colon
-    for a protocol.
+    OpenCV gets the path of an open file descriptor: it would end the process at a name that is not
+    UTF-8, and FFmpeg takes a name with a colon for a protocol.
     """
     with _opened(path) as name, silent_opencv():
         film = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
@@ -140,8 +141,8 @@ def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
 
 @contextmanager
 def silent_opencv() -> Iterator[None]:
-    """Silence OpenCV's warning on stderr about a film that it cannot open; the error has more
-    details."""
+    """Silence OpenCV's warning on stderr about a film that it cannot open, because the raised error
+    has more details."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
@@ -190,7 +191,7 @@ def _unconverted(errors: DecodingErrors) -> str:
 
 
 def no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:
-    """Why a film that could be opened has no frame."""
+    """A text about why no frame of a film that could be opened can be read."""
     packed = int(film.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
     code = packed.to_bytes(4, "little").decode("latin-1").strip("\0 ")
     codec = CODECS.get(code, code if code.isprintable() else "") or "its codec"

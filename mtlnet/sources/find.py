@@ -55,12 +55,13 @@ class Source:
 def find_sources(
     inputs: list[str], note: Note = lambda line: None, topic: str = ""
 ) -> list[Source]:
-    """The sources that arguments name: a file, the files of a folder or pattern, a webcam by its
+    """The sources that `inputs` name: a file, the files of a folder or pattern, a webcam by its
     number, a stream by its address.
 
-    In natural order (`frame2` before `frame10`). An argument that names nothing becomes a source
-    with a problem. `note`: called with a line about what is left out: other files and subfolders of
-    a folder. `topic`: of recordings; empty: the only topic with pictures.
+    The files of an input are in natural order (`frame2` before `frame10`). An input that names
+    nothing becomes a source with a problem. `note` is called with a line about other files and
+    subfolders of a folder, which are left out. `topic`: topic to read from recordings; empty: the
+    only topic with pictures.
     """
     return [source for given in inputs for source in _find(given, note, topic)]
 

@@ -1,7 +1,5 @@
-"""The kind of a file: image, film, recorded round or other recording.
-
-Determined by its first bytes, or else by its name.
-"""
+"""Determines the kind of a file (image, film, recorded round or other recording) by its first
+bytes, or else by its name."""
 
 from contextlib import suppress
 from enum import Enum
@@ -39,7 +37,7 @@ ROUND, MCAP_START = ".mcap", b"\x89MCAP"
 ROUND_NAME, TAIL_BYTES = (
     b"driverview.round",
     1 << 16,
-)  # name of its metadata, at the file's start or in its index
+)  # name of a round's metadata record, which is at the file's start or in its index
 SQLITE_START = b"SQLite format 3\0"
 BAG_METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
 HEAD_BYTES = 400
@@ -53,7 +51,7 @@ FILM_STARTS = (
     b"\0\0\x01", bytes.fromhex("3026b2758e66cf11"),
 )  # fmt: skip
 MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide")
-TS_PACKETS = ((0, 188), (4, 192))  # MPEG-TS, and with the times of Blu-ray
+TS_PACKETS = ((0, 188), (4, 192))  # first sync byte and packet size: MPEG-TS, Blu-ray's MPEG-TS
 
 
 def kind_of(path: Path) -> SourceKind | None:

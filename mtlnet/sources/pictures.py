@@ -1,4 +1,5 @@
-"""Pictures of a film, a stream or a recording, and how they are fitted to the model's camera."""
+"""Pictures of a film, stream or recording, and their conversion to the view of the model's
+camera."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,8 +15,8 @@ from trackfeatures.camera import CameraParameters
 
 Image = NDArray[np.uint8]
 Lens = Rectification | float | None
-"""Camera of pictures: a rectification from it, its vertical field of view in degrees, or None for
-the model's camera."""
+"""Camera of pictures: a rectification from this camera to the model's, the vertical field of view
+in degrees, or None for the model's camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +35,16 @@ class Picture:
 
 @runtime_checkable
 class LensFinder(Protocol):
-    """Finds the camera of a stream while it runs."""
+    """Interface of an object that finds the camera of a stream while its pictures arrive."""
 
     def at(self, picture: Picture) -> Lens:
-        """The lens for this picture, the next one in order; None until it is known."""
+        """The lens for `picture`; None until the camera is found. Must be called for each picture
+        in order."""
 
 
 class Pictures(Protocol):
-    """A source of pictures. `fault`, set after the last picture, is a text about the source's
-    fault; empty if it has none."""
+    """Interface of a source of pictures. `fault`, set after the last picture, describes the
+    source's fault; empty if it has none."""
 
     fault: str
 
@@ -51,9 +53,10 @@ class Pictures(Protocol):
 
 
 def fit(picture: Picture, camera: CameraParameters, lens: Lens) -> Image:
-    """The picture fitted to the model's camera: uint8 RGB (camera.height, camera.width, 3).
+    """The picture in the view of the model's `camera`: uint8 RGB (camera.height, camera.width, 3).
 
-    The order of the colours is converted last, when the picture is small. Raises ImageError.
+    Colours are converted from BGR last, when the picture is small. Raises ImageError when the
+    picture does not show enough of this view.
     """
     assert picture.image is not None
     if isinstance(lens, Rectification):

@@ -42,7 +42,7 @@ class SourceImage:
     """One image at the model's size, or the reason why it cannot be used."""
 
     source: str
-    """File, webcam or address."""
+    """Name of the file or webcam, or address of the stream."""
     frame: int | None
     """Number of the frame in a film, stream, round or recording, from 0; None for a single
     image."""
@@ -106,8 +106,8 @@ def _read_file(source: Source, camera: CameraParameters) -> Iterator[SourceImage
 
 
 def _read_pictures(source: Source, camera: CameraParameters) -> Iterator[SourceImage]:
-    """Images of a film, a stream or a recording. An ImageError ends it, because its pictures are
-    all alike."""
+    """The images of a film, stream or recording. An ImageError ends the source, because all its
+    pictures have the same camera."""
     reader: Pictures = Film(source.path) if source.opened is None else source.opened
     for picture in reader.pictures():
         if picture.image is None:
@@ -144,7 +144,7 @@ def _read_round(source: Source, camera: CameraParameters) -> Iterator[SourceImag
     frames = Frames([info], [index], recorded)
     lens = round_rectification(info, camera) if moved_rounds(frames) else None
     labels: Labels | None = None
-    with suppress(DatasetError):  # some are damaged: read one by one
+    with suppress(DatasetError):  # if some labels are damaged, they are read one by one below
         labels = frames.labels
     for number in range(len(frames)):
         try:

@@ -1,7 +1,8 @@
-"""Live pictures: a webcam by its number or device, a stream by its address (RTSP, HTTP, ...).
+"""Reads live pictures of a webcam, by its number or device, or of a stream, by its address (RTSP,
+HTTP, ...).
 
-Source of addresses and their options: FFmpeg's protocols. Every wait has a time limit: a stream
-that stalls is reported and ends; the answers so far are kept.
+FFmpeg's documentation of protocols describes the addresses and their options. Every wait has a time
+limit: a stream that stalls ends with a fault, and the answers so far are kept.
 """
 
 import re
@@ -23,22 +24,22 @@ from trackfeatures.errors import UserError
 SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp", "rtp")
 ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 OPEN_S, STALL_S = 10.0, 10.0
-"""Time limits, s, for the first picture and for each later one: a camera on a slow link sends some
-pictures per second; the longest usual interval between key frames is about 10 s."""
-AT_ONCE_S = 0.05
+"""Time limits, s, for the first picture and for each later picture. The longest usual interval
+between key frames is about 10 s."""
+AT_ONCE_S = 0.05  # a read that takes longer has waited for its picture
 DEVICES = Path("/dev")
 
 
 def is_live(given: str) -> bool:
-    """Whether an input names a webcam or an address; an existing file of that name has
-    precedence."""
+    """Whether an input names a webcam or the address of a stream, and no existing file or
+    folder."""
     if Path(given).is_file() or Path(given).is_dir():
         return False
     return given.isdecimal() or given.startswith("/dev/video") or bool(ADDRESS.match(given))
 
 
 def shown_name(given: str) -> str:
-    """The input without the password, for tables, films and messages."""
+    """The name of an input in tables, films and messages: an address has no user and password."""
     if given.isdecimal():
         return f"webcam {given}"
     parts = urlsplit(given) if ADDRESS.match(given) else None
@@ -49,8 +50,8 @@ def shown_name(given: str) -> str:
 
 @dataclass
 class Stream:
-    """An opened webcam or stream. `fault` as in `Pictures`; `note`: how it ended without a
-    fault."""
+    """An opened webcam or stream. After the last picture, `fault` describes its fault; if it has
+    none, `note` is a text about its end."""
 
     name: str
     film: cv2.VideoCapture
@@ -87,8 +88,8 @@ class Stream:
                 number += 1
 
     def _note_damage(self, number: int) -> None:
-        """Count an error of picture `number`; a stream joined between key frames starts with
-        errors."""
+        """Count a picture in which FFmpeg reported an error. Picture 0 is not counted, because a
+        stream joined between key frames starts with errors."""
         if self.errors.count and number:
             self.damaged += 1
             self.first_error = self.first_error or self.errors.first
@@ -116,7 +117,8 @@ class Stream:
 
 
 def open_stream(given: str) -> Stream:
-    """Open a webcam or stream. Raises UserError when that fails or takes longer than `OPEN_S`."""
+    """Open the webcam or stream named `given`. Raises UserError when it cannot be opened, for a
+    stream within `OPEN_S`."""
     name = shown_name(given)
     scheme = ADDRESS.match(given)
     if scheme and scheme[1].lower() not in SCHEMES:

@@ -1,4 +1,4 @@
-"""The camera of a recording's pictures, from ROS `CameraInfo` or Foxglove `CameraCalibration`.
+"""Reads the camera of a recording's pictures from ROS `CameraInfo` or Foxglove `CameraCalibration`.
 
 These messages state matrix and distortion; the mount on the car is taken from the model's camera.
 Sources: ROS `sensor_msgs/CameraInfo`, REP 104 of image_pipeline, Foxglove's schema.
@@ -25,9 +25,10 @@ MAX_NUMBER = 1e6  # limit of a matrix (px) or a distortion; damaged files exceed
 
 
 def calibration_topic(image_topic: str, topics: list[Topic]) -> Topic | None:
-    """The calibration topic of an image topic: in its namespace or the nearest one around it.
+    """The calibration topic in the namespace of an image topic, or in the nearest enclosing
+    namespace.
 
-    None if there is none, or if several are equally near.
+    None if there is no calibration topic, or if the nearest namespace has several.
     """
     image = PurePosixPath(image_topic)
     places = [image, *image.parents]
@@ -41,9 +42,9 @@ def calibration_topic(image_topic: str, topics: list[Topic]) -> Topic | None:
 
 
 def camera_of(message: Any, image_topic: str, mount: CameraParameters) -> CameraParameters:
-    """The camera in a calibration message, mounted as `mount`.
+    """The camera in a calibration message, with position and angles of the camera `mount`.
 
-    Raises UserError if the message has no calibration, or a lens model that is not read.
+    Raises UserError if the message has no calibration, or an unsupported lens model.
     """
     is_ros = hasattr(message, "header")
     names = "dkp" if is_ros else "DKP"

@@ -1,8 +1,9 @@
-"""Foxglove's `CompressedVideo`: one picture per message, decoded from a file by OpenCV's FFmpeg.
+"""Decodes Foxglove's `CompressedVideo`, one picture per message, with OpenCV's FFmpeg.
 
-In an IVF file each message has its number as its time, so that an undecodable picture does not
-shift the others. IVF does not support H.265 in FFmpeg: such messages become a raw stream, whose
-pictures are counted. Source: the IVF header of libvpx.
+The messages are written to a temporary IVF file, in which the time of each message is its number.
+So an undecodable picture does not change the numbers of later pictures. FFmpeg does not read H.265
+in IVF: H.265 messages are written as a raw stream, whose decoded pictures are counted. Source: the
+IVF header of libvpx.
 """
 
 import struct
@@ -25,7 +26,8 @@ RATE = 1000
 
 
 class CodedFilm:
-    """Collects the messages of a topic, then decodes them. `fault` as in `Pictures`."""
+    """Collects the messages of a topic, then decodes them. `fault`, set after the last picture,
+    describes missing pictures; empty if none is missing."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -34,9 +36,9 @@ class CodedFilm:
         self._in_ivf = True
 
     def pictures(self, packets: Iterator[tuple[float, str, bytes]]) -> Iterator[Picture]:
-        """Yields the pictures of messages given as time in s, format and data.
+        """Yields the pictures of `packets`, each a message's time in s, format and data.
 
-        Raises UserError for a format that is not read.
+        Raises UserError for an unsupported format.
         """
         with TemporaryDirectory(prefix="driverview-") as folder:
             file = Path(folder) / "film"

@@ -1,8 +1,8 @@
-"""The messages of a recording in any container: an MCAP file, or a ROS 2 bag of any storage.
+"""Reads the messages of a recording: an MCAP file, or a ROS 2 bag of any storage.
 
-The official reader of MCAP reads MCAP files and uncompressed bags of such files, so that a
-truncated file is read as far as possible; `rosbags` reads the others (sqlite3, compressed files or
-messages).
+The official reader of MCAP reads MCAP files and uncompressed bags of MCAP files, so that a
+truncated file is read as far as possible. `rosbags` reads all other bags (sqlite3, compressed files
+or messages).
 """
 
 import struct
@@ -30,20 +30,22 @@ DAMAGE = (
 
 
 class Container(Protocol):
-    """A recording. `fault`, set after the last message, is a text about what is missing; empty if
-    nothing is missing."""
+    """Interface of a recording. `fault`, set after the last message, describes what is missing;
+    empty if nothing is missing."""
 
     fault: str
 
     def topics(self) -> list[Topic]:
-        """Topics with messages, ordered by name. Raises UserError, OSError."""
+        """Topics with messages, ordered by name. Raises UserError or OSError for an unreadable
+        recording."""
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        """Log time (ns since 1970) and content of each message of a topic, in order."""
+        """Yields log time (ns since 1970) and content of each message of a topic, in order."""
 
 
 def open_container(path: Path) -> Container:
-    """The recording at `path`, a file or the folder of a bag. Raises UserError, OSError."""
+    """The recording at `path`, a file or the folder of a bag. Raises UserError or OSError when it
+    cannot be read."""
     if path.is_dir():
         about = bag_metadata(path) or {}
         if about.get("storage_identifier") != "mcap" or about.get("compression_mode"):
@@ -231,5 +233,5 @@ def _bag_errors() -> tuple[type[Exception], ...]:
 
 
 def names_of(topics: Collection[Topic]) -> str:
-    """Topics as listed in a message."""
+    """The topics as a list with commas, for a message; "none" if there are none."""
     return ", ".join(map(str, topics)) or "none"

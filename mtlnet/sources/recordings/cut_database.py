@@ -1,6 +1,6 @@
-"""A ROS 2 bag in a truncated SQLite file, read as far as possible.
+"""Reads a ROS 2 bag from a truncated SQLite file, as far as possible.
 
-`rosbags` refuses such a file, and so does SQLite unless its check of the file's size is switched
+`rosbags` refuses a truncated file. SQLite reads it only if its check of the file's size is switched
 off. Messages are read in the order in which they were written, up to the first missing page.
 """
 
@@ -18,7 +18,7 @@ WITHOUT_CHECK = (
 
 
 class CutDatabase:
-    """A truncated bag. `fault` as in `Container`."""
+    """A truncated bag. `fault`, set after the last message, states where the file ends."""
 
     def __init__(self, path: Path, reason: str) -> None:
         self._path, self._reason = path, reason

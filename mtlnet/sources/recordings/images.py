@@ -1,4 +1,4 @@
-"""The picture in one message of a recording, for the image types of Foxglove and ROS 2.
+"""Decodes the picture in one message of a recording, for the image types of Foxglove and ROS 2.
 
 A picture in a file format (JPEG, PNG, ...) gives the same pixels as a file with the same bytes.
 """
@@ -35,10 +35,10 @@ IMAGES = (ROS_COMPRESSED, ROS_IMAGE, COMPRESSED, RAW, VIDEO)
 
 
 def reader_of(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
-    """A function from the bytes of a message to its fields; None if the type is not read.
+    """A function that parses the bytes of a message; None if its type is not supported.
 
-    Foxglove's messages in any encoding become protobuf messages, ROS's messages become messages of
-    `rosbags`. The function raises ImageError.
+    It returns protobuf messages for Foxglove's types in any encoding, and messages of `rosbags` for
+    ROS types. It raises ImageError for damaged bytes.
     """
     if encoding not in ENCODINGS.get(schema, ()):
         return None
@@ -58,7 +58,7 @@ def time_of(message: Any) -> float:
 def picture_of(message: Any, schema: str) -> Image:
     """The picture in a message of one of `IMAGES` except `VIDEO`: uint8 RGB (H, W, 3).
 
-    Raises ImageError.
+    Raises ImageError for a damaged or unsupported picture.
     """
     if schema == ROS_IMAGE:
         return decode_raw(
@@ -123,7 +123,8 @@ def _damaged(schema: str, error: Exception) -> ImageError:
 
 @cache
 def _ros_types() -> Any:
-    """Message types of ROS itself, never those that a bag declares; they have not changed."""
+    """The message types of ROS 2 itself, not the types that a bag declares. The image types are
+    equal in all releases."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)

@@ -1,7 +1,6 @@
-"""Raw pictures of ROS and Foxglove messages as RGB: their encodings and row lengths.
+"""Converts raw pictures of ROS and Foxglove messages to RGB. Samples of 16 bits are reduced to 8.
 
-Sources: ROS `sensor_msgs/image_encodings.hpp`, Foxglove's schema `RawImage`. 16 bits are reduced to
-8.
+Sources: ROS `sensor_msgs/image_encodings.hpp`, Foxglove's schema `RawImage`.
 """
 
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Layout of an encoding: samples per pixel, bytes per sample, and OpenCV's conversion to
-    RGB."""
+    """Layout of an encoding: samples per pixel, bytes per sample, and OpenCV's code for the
+    conversion to RGB (None: no conversion)."""
 
     samples: int
     bytes: int
@@ -53,9 +52,10 @@ for _order in ("RGGB", "BGGR", "GBRG", "GRBG"):
 def decode_raw(
     data: NDArray[np.uint8], encoding: str, width: int, height: int, step: int, *, big_endian: bool
 ) -> Image:
-    """The picture in `data` as uint8 RGB (height, width, 3); `step`: bytes per row, with padding.
+    """The picture in `data` as uint8 RGB (height, width, 3).
 
-    Raises ImageError for an encoding that is not a picture, or too little data.
+    `step`: bytes per row, with padding; 0: rows without padding. Raises ImageError for an
+    unsupported encoding, or too little data.
     """
     layout = LAYOUTS.get(encoding)
     if layout is None:

@@ -1,4 +1,4 @@
-"""A recording as a source of pictures: chooses the topic and decodes its messages in order."""
+"""Reads the pictures of a recording: chooses the topic and decodes its messages in order."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -27,7 +27,8 @@ KNOWN = ", ".join(IMAGES)
 
 @dataclass
 class Recording:
-    """The pictures of one topic. `fault` as in `Pictures`."""
+    """The pictures of one `topic` of a recording, which has the given `topics`. `fault`, set after
+    the last picture, describes the recording's fault; empty if it has none."""
 
     path: Path
     container: Container
@@ -41,8 +42,8 @@ class Recording:
         return self.topic.count or 0
 
     def pictures(self) -> Iterator[Picture]:
-        """Yields each message's picture, numbered from 0, with the time of its header or else its
-        record.
+        """Yields each message's picture, numbered from 0, with the time in its header, or its log
+        time if the header has none.
 
         A message that cannot be decoded becomes a picture with an error.
         """
@@ -64,10 +65,11 @@ class Recording:
         self.fault = self.container.fault
 
     def camera(self, mount: CameraParameters) -> tuple[CameraParameters | None, str]:
-        """The camera that the recording states, mounted as `mount`, and a line of text about it.
+        """The camera that the recording states, with position and angles of the camera `mount`, and
+        a line of text about it.
 
-        None with a line about the reason if it states one that cannot be used; None and an empty
-        line if it states none.
+        Returns None and a line with the reason if this camera cannot be used; None and an empty
+        line if the recording states no camera.
         """
         topic = calibration_topic(self.topic.name, self.topics)
         if topic is None:
@@ -111,9 +113,10 @@ class Recording:
 
 
 def open_recording(path: Path, topic: str = "") -> Recording:
-    """The pictures of `topic`, or of the only topic with pictures.
+    """The pictures of `topic` in the recording at `path`; empty: of the only topic with pictures.
 
-    Raises UserError where there is no such topic, none or several; OSError.
+    Raises UserError if `topic` does not exist or has no pictures, or if it is empty and not exactly
+    one topic has pictures; OSError for an unreadable file.
     """
     container = open_container(path)
     topics = container.topics()
