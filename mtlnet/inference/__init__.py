@@ -1,1 +1,1 @@
-"""Running a published model on images, without torch: all of mtlnet that `serve` may import."""
+"""Runs a finished model on images, without torch: the only part of mtlnet that `serve` imports."""

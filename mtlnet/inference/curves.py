@@ -1,4 +1,4 @@
-"""Reads `curves.csv`, the training curves of a run: losses, learning rate and speed per step."""
+"""Reads `curves.csv`, the training curves of a run: losses, task weights, learning rate, speed."""
 
 import math
 from pathlib import Path
@@ -21,9 +21,10 @@ HEADER = ",".join(COLUMNS) + "\n"
 
 
 def read_curves(path: Path) -> list[dict[str, float]]:
-    """The rows of a `curves.csv` by column; none for a missing file or other columns.
+    """The rows of a `curves.csv`, each a dict from column name to value; an empty list if the file
+    is missing or has other columns.
 
-    Damaged rows are skipped: a full disk or a power failure can truncate the last one.
+    Damaged rows are skipped, because a full disk or a power failure can truncate the last row.
     """
     if not path.is_file():
         return []

@@ -33,7 +33,7 @@ INT8 = Path("export") / "openvino-int8"
 
 
 class Engine(Protocol):
-    """A loaded model; it must not be shared between threads."""
+    """Interface of a loaded model; an engine must not be shared between threads."""
 
     @property
     def card(self) -> ModelCard:
@@ -131,8 +131,8 @@ def _read_model(graph: Path) -> Any:
 
 
 def read_graph(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run: its stored graph. A run that was written without OpenVINO or
-    by an earlier `mtlnet ship` has none; its weights are converted, which needs torch.
+    """The OpenVINO model of a run, read from its stored graph. A run written without OpenVINO or by
+    an earlier `mtlnet ship` has no graph; then its weights are converted, which requires torch.
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
     """
@@ -153,10 +153,11 @@ def read_graph(run: Path, card: ModelCard) -> Any:
 def run_graph(
     graph: Any, precision: str, images: NDArray[np.uint8], batch: int = 1
 ) -> NDArray[np.float32]:
-    """Outputs (N, K; columns: `split_outputs`) of an OpenVINO model for images (N, 210, 280, 3).
+    """Outputs (N, K) of an OpenVINO model for uint8 images (N, 210, 280, 3).
 
-    `graph`: the model or the path of its file; `batch`: images per inference. Raises RuntimeError
-    when OpenVINO cannot load it.
+    `graph`: the model or the path of its file; `precision`: "f32" or "bf16"; `batch`: images per
+    inference. `mtlnet.inference.prediction.split_outputs` explains the K columns. Raises
+    RuntimeError when OpenVINO cannot load the model.
     """
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
     source = str(graph) if isinstance(graph, Path) else graph
@@ -165,12 +166,12 @@ def run_graph(
     return np.concatenate([request.infer([part])[0].copy() for part in parts])
 
 
-# Exports of a run. Each has an `export.json` of `mtlnet export`.
+# Exports of a run. The folder of each export has an `export.json`, written by `mtlnet export`.
 
 
 def read_export(folder: Path) -> dict[str, Any] | None:
-    """Content of the `export.json` of a folder; None if there is none. Raises ModelError when
-    damaged."""
+    """Content of the `export.json` of a folder; None if the file does not exist. Raises ModelError
+    when it is damaged."""
     path = folder / EXPORT_FILE
     if not path.is_file():
         return None
@@ -187,9 +188,8 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
     """Whether int8 is the default precision of a run on this processor.
 
     True if the run has an int8 graph of the card's weights that passed its accuracy gate
-    (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor that does not
-    may round sums differently, and uses a graph only if the gate was judged on a processor without
-    native int8, too.
+    (`mtlnet.export.int8`), and the processor multiplies int8 natively. Other processors can round
+    sums differently, so there it is true only if the gate was judged without native int8, too.
     """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:
@@ -199,8 +199,8 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
 
 
 def int8_graph(run: Path, card: ModelCard) -> Path:
-    """Path of a run's int8 graph. Raises ModelError if it is missing, damaged or of other
-    weights."""
+    """Path of a run's int8 graph. Raises ModelError if it is missing, damaged, or made from other
+    weights than the card's."""
     folder = run / INT8
     about = read_export(folder)
     how = f"make it with `mtlnet export --model {run} --format openvino --precision int8`"
@@ -216,14 +216,15 @@ def int8_graph(run: Path, card: ModelCard) -> Path:
 
 
 def parse_kind(text: str) -> EngineKind:
-    """The kind of engine called `text`. Raises ModelError for an unknown one."""
+    """The kind of engine called `text`. Raises ModelError for an unknown name."""
     if text not in get_args(EngineKind):
         raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
     return cast(EngineKind, text)
 
 
 def parse_precision(text: str | None) -> Precision | None:
-    """The precision called `text`; None for the default. Raises ModelError for an unknown one."""
+    """The precision called `text`; None stands for the default. Raises ModelError for an unknown
+    name."""
     if text not in (None, *get_args(Precision)):
         raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
     return cast(Precision | None, text)

@@ -1,4 +1,4 @@
-"""The golden image: a drawn road; every model card states the model's outputs for it."""
+"""Draws the golden image, a road for which every model card states the model's outputs."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,9 @@ SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230
 def golden_image(width: int, height: int) -> NDArray[np.uint8]:
     """A straight one-lane road under a clear sky, uint8 RGB (height, width, 3).
 
-    The card of a model states its outputs for this image; the service compares its own outputs with
-    them at start. Drawn in integers, so that it is the same on every machine.
+    The card of a model states the model's outputs for this image; the service compares its own
+    outputs with them at start. The image is computed in integers, so that it is the same on every
+    machine.
     """
     image = np.empty((height, width, 3), np.uint8)
     horizon = height // 2

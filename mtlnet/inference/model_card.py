@@ -1,4 +1,4 @@
-"""The card of a trained model (`card.json`); how the folder of a run is found and checked.
+"""Reads and writes the card of a trained model (`card.json`); finds and checks the folder of a run.
 
 The folder of a run contains `card.json`, `config.json`, `model.safetensors` (the weights, batch
 normalisation folded), `uncertainty.safetensors` (the uncertainty head), `model.xml` and `model.bin`
@@ -41,11 +41,13 @@ SHIPPED_FILES = {
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 6  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
 LISTING_FORMAT = 5
-"""The format that lists every round; it is read, too (`mtlnet.inference.trained_rounds`)."""
+"""An earlier format, whose cards list every round; it can still be read
+(`mtlnet.inference.trained_rounds`)."""
 
 
 class ModelError(UserError):
-    """A model is missing, unfinished or damaged, or does not fit the image or the data."""
+    """Raised for a model that is missing, unfinished or damaged, or does not fit the image or the
+    data."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class ModelCard:
     golden: tuple[float, ...]
     """Outputs (9,) of torch in float32 for the golden image (`mtlnet.inference.golden_image`)."""
     uncertainty: dict[str, Any] | None
-    """Description of the fit of the uncertainty head; None for a model without one."""
+    """Description of the fit of the uncertainty head; None for a model without this head."""
 
     @property
     def model_hash(self) -> str:
@@ -89,7 +91,7 @@ class ModelCard:
             )
 
     def write(self, run: Path) -> None:
-        """Write `card.json`, atomically."""
+        """Write `card.json` into the folder `run`, atomically."""
         content = {"format": FORMAT, "model_hash": self.model_hash}
         content |= asdict(self, dict_factory=stored)
         write_json(run / CARD, content)
@@ -98,8 +100,8 @@ class ModelCard:
 def read_card(run: Path) -> ModelCard:
     """The card of the run in folder `run`.
 
-    Raises ModelError when it is missing or unreadable, DefinitionsMismatch for a model of another
-    version of the track-feature definitions.
+    Raises ModelError when the card is missing, unreadable or of another format, DefinitionsMismatch
+    for a model of another version of the track-feature definitions.
     """
     path = run / CARD
     if not run.is_dir():
@@ -146,7 +148,7 @@ def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
         found = file_hash(path)
         if found != card.files.get(name):
             raise ModelError(
-                f"{path} is damaged: its SHA-256 begins {found[:12]}, the card says "
+                f"{path} is damaged: its SHA-256 begins {found[:12]}, the card has "
                 f"{str(card.files.get(name))[:12]}; train the model anew or restore the file"
             )
 
@@ -154,9 +156,9 @@ def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
 def resolve_run(name: str | Path, runs: Path = RUNS) -> Path:
     """The folder of a run given as a path, a name in `runs/`, "latest", or a shipped model's name.
 
-    Shipped are "default" and "varied" (for real roads). Without a shipped "default", that name is
-    the latest run. A folder or a run of the name "varied" comes before the shipped model. Symbolic
-    links are resolved.
+    The shipped models are "default" and "varied" (for real roads). "default" stands for the latest
+    run if no model is shipped. A folder or a run called "varied" has precedence over the shipped
+    model. Symbolic links are resolved. Raises ModelError when there is no such run.
     """
     if str(name) == "default":
         if (SHIPPED / CARD).is_file():

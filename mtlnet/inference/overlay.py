@@ -1,6 +1,6 @@
-"""Draws predicted and true markings over a frame, beside a view of the car from above.
+"""Draws predicted and true markings over a frame, and a view of the car from above beside it.
 
-Flat road. Car frame: x ahead, y left (m).
+The road is assumed to be flat. In the car frame x points ahead and y to the left, m.
 """
 
 import math
@@ -24,7 +24,7 @@ SCALE = 2
 LINE_SHARE = 200
 """Number of image rows per pixel of line width."""
 MAX_PX = 1e4
-"""Limit of projected points, px; points farther outside the image are left out, because OpenCV
+"""Limit of the coordinates of projected points, px; points beyond it are left out, because OpenCV
 would overflow."""
 TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 
@@ -32,10 +32,10 @@ TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 def marking_line(
     distance: float, angle: float, curvature: float, at: ArrayLike | None = None
 ) -> NDArray[np.float64]:
-    """Points (N, 2) of a marking `distance` m to the right of the car, m in the car frame.
+    """Points (N, 2), m in the car frame, of a marking `distance` m to the right of the car.
 
-    `angle`: of the car to the track, rad; `curvature` of the track: 1/m, positive to the left; `at`
-    (N,): positions along the track, m; None: 24 points ahead of the car.
+    `angle`: angle of the car to the track, rad; `curvature` of the track: 1/m, positive to the
+    left; `at` (N,): positions along the track, m; None: 24 points `NEAR_M` to `FAR_M` ahead.
     """
     along = np.linspace(NEAR_M, FAR_M, 24) if at is None else np.asarray(at, np.float64)
     left = curvature * along**2 / 2 - distance
@@ -44,8 +44,8 @@ def marking_line(
 
 
 def to_pixels(points: NDArray[np.float64], camera: CameraParameters) -> NDArray[np.int32]:
-    """Pixels (M, 2), enlarged by `SCALE`, of the road points (N, 2) in the car frame that the
-    camera sees."""
+    """Pixels (M, 2), in an image enlarged by `SCALE`, of the M road points that the camera sees of
+    `points` (N, 2), m in the car frame."""
     road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -83,9 +83,9 @@ def draw_overlay(
 
 
 def draw_markings(image: Image, camera: CameraParameters, prediction: Prediction) -> Image:
-    """A copy of an image (H, W, 3) RGB of `camera` with the markings drawn, at its own size.
+    """A copy of an image (H, W, 3) RGB of `camera` with the markings drawn, at the image's size.
 
-    For a flat and straight road, because the curvature is not predicted.
+    The markings are drawn straight, because the curvature is not predicted.
     """
     canvas = image.copy()
     width = max(round(image.shape[0] / LINE_SHARE), 1)
@@ -103,7 +103,8 @@ def draw_road_line(
     colour: tuple[int, int, int],
     thickness: int,
 ) -> None:
-    """Draw points (N, 2) of the road, m in the car frame, where the camera sees them."""
+    """Draw a line through `points` (N, 2) of the road, m in the car frame, where the camera sees
+    them. Changes `canvas` in place; `thickness` in px."""
     road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < MAX_PX).all(1)]

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 
 FEATURES = (*tf.MARKINGS, "to_lane_centre", "angle")
-"""Features that have a standard deviation, in m, and in rad for the angle."""
+"""Features that have a standard deviation; its unit is m, for the angle rad."""
 COLUMNS = len(FEATURES) + 1
 """Number of columns of the uncertainty head: the standard deviations and the out-of-distribution
 score."""
 OUTPUTS = 9  # five coded distances, the coded angle, three class probabilities
 MARKINGS = len(tf.MARKINGS)
 ROAD_CLASSES = tuple(heading.name.lower() for heading in tf.RoadClass)
-# Whether outputs have uncertainty and absence columns, by their number of columns.
+# Maps the number of columns of outputs to whether they have uncertainty and absence columns.
 _HAS = {
     OUTPUTS + with_uncertainty * COLUMNS + with_absent * MARKINGS: (with_uncertainty, with_absent)
     for with_uncertainty in (False, True)
@@ -31,7 +31,7 @@ _HAS = {
 
 @dataclass(frozen=True, slots=True)
 class OutputParts:
-    """Parts of a model's outputs; for N images each has a first axis (N, ...)."""
+    """Parts of a model's outputs; for the outputs of N images, each part has a first axis N."""
 
     coded: NDArray[np.float32]
     """Coded values (..., 6): five distances and the angle."""
@@ -40,18 +40,19 @@ class OutputParts:
     std: NDArray[np.float32] | None
     """Standard deviations (..., 7); None for a model without an uncertainty head."""
     ood_score: NDArray[np.float32] | None
-    """Out-of-distribution score (...), above 1 out of distribution; None as for `std`."""
+    """Out-of-distribution score (...); an image with a score above 1 is out of distribution. None
+    for a model without an uncertainty head."""
     absent: NDArray[np.float32] | None
     """Probability that each marking is absent (..., 5); None for heads of coded values."""
 
 
 def split_outputs(outputs: NDArray[np.float32]) -> OutputParts:
-    """Split outputs (..., K) into their parts: nine outputs (five coded distances, coded angle,
-    three class probabilities), then 8 of the uncertainty head and 5 probabilities of absence, if
-    the model has them. So K is 9, 14, 17 or 22.
+    """Split outputs (..., K) into their parts.
 
-    `mtlnet.model.uncertainty_head` defines the uncertainty columns. Raises ValueError for another
-    number of columns.
+    The first nine columns are five coded distances, the coded angle and three class probabilities.
+    If the model has them, 8 columns of the uncertainty head and 5 probabilities of absence follow,
+    so K is 9, 14, 17 or 22. `mtlnet.model.uncertainty_head` defines the uncertainty columns. Raises
+    ValueError for another number of columns.
     """
     width = outputs.shape[-1] if outputs.ndim else 0
     if width not in _HAS:
@@ -78,9 +79,9 @@ class Prediction:
     """
 
     distances_m: dict[str, float | None]
-    """Distance by marking; None where the marking is absent."""
+    """Distance in m by marking; None if the marking is absent."""
     to_lane_centre_m: float | None
-    """Offset from the lane's centre, positive to the left; None where no marking is near."""
+    """Offset from the lane's centre, m, positive to the left; None if all markings are absent."""
     angle_rad: float
     heading: dict[str, float]
     """Probability of each class of the road, by name."""
@@ -88,7 +89,7 @@ class Prediction:
     """Standard deviation of the error of each of `FEATURES`, m or rad;
     None for an absent feature."""
     out_of_distribution: bool | None = None
-    """Whether the image differs from the training images more than these differ from each other."""
+    """Whether the image is unlike the training images: its out-of-distribution score is above 1."""
     absent: dict[str, float] | None = None
     """Probability that each marking is absent; None for a model with heads of coded values."""
 
@@ -111,8 +112,10 @@ class Prediction:
 
 
 def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
-    """Decode the outputs (K,) of one image. Raises ValueError as `split_outputs`, which explains
-    K."""
+    """Decode the outputs (K,) of one image; `split_outputs` explains the K numbers.
+
+    Raises ValueError for another shape.
+    """
     if outputs.ndim != 1:
         raise ValueError(f"the outputs of one image have one axis, not shape {outputs.shape}")
     parts = split_outputs(outputs)

@@ -1,11 +1,11 @@
 """Rectifies images of another camera to the model's camera; converts answers back to metres.
 
-Each pixel of the model's view is looked up where the other camera, with its lens and mount, sees
-the same direction in the car's frame. This is exact for any scene, because the optical centre does
-not move (Hartley and Zisserman 2004, section 8.4). The rectified picture therefore looks along the
-car, whatever the camera's mount. Areas that the camera does not show are grey, as in training. A
-camera at another height sees a flat road enlarged, so answers in metres are scaled by the ratio of
-the heights.
+Each pixel of the model's view is read from the pixel in which the other camera, with its lens and
+mount, sees the same direction in the car's frame. This is exact for any scene, because the optical
+centre does not move (Hartley and Zisserman 2004, section 8.4). The rectified picture therefore
+looks along the car, whatever the camera's mount. Areas that the camera does not show are grey, as
+in training. At another height a camera sees a flat road enlarged or reduced, so answers in metres
+are scaled by the ratio of the heights.
 """
 
 from dataclasses import dataclass, replace
@@ -24,18 +24,19 @@ from trackfeatures.coding import OFFSET, SPAN
 
 CAMERA_FILE = "camera.yaml"
 LEAST_SHOWN = 0.25
-"""Least share of the model's rows, and of its columns, that an image must show."""
+"""Minimum share of the rows, and of the columns, of the model's view that an image must show."""
 LEAST_ROAD = 0.1
-"""Least share of the model's rows below the horizon that an image must show."""
+"""Minimum share of the rows of the model's view below the horizon that an image must show."""
 COMMON_LANE_M = 3.6
 SEEN_LANES_M = (2.75, 4.4)
-"""Range of lane widths in training, m at the model's camera. A camera at a height that makes a
-common lane look wider or narrower is out of distribution."""
+"""Range of lane widths in training, m at the model's camera. A camera is out of distribution if its
+height makes a lane of `COMMON_LANE_M` look wider or narrower than this range."""
 BORDER_LEVEL = 128
-"""Grey level of areas that an image does not show: almost 0 for the network, like its padding."""
+"""Grey level of areas that an image does not show. The network's normalisation makes it almost 0,
+like the padding of convolutions."""
 TOLERANCE = 0.01
 HEIGHT_SCORE = 2.0
-"""Least `ood_score` of an image of a camera that is too high or too low."""
+"""Minimum `ood_score` of an image of a camera that is too high or too low."""
 OUTSIDE = -1e4  # outside every image, px
 KEPT_MAPS = 16
 
@@ -54,8 +55,8 @@ class Rectification:
     source: CameraParameters
     target: CameraParameters
     any_height: bool = False
-    """Whether every height is in distribution, as in recorded rounds, whose camera heights were
-    drawn together with their lane widths."""
+    """Whether a camera at any height is in distribution. True for recorded rounds, whose camera
+    heights were chosen together with their lane widths."""
 
     @property
     def scale(self) -> float:
@@ -71,13 +72,13 @@ class Rectification:
     def image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An image (H, W, 3) of the source as uint8 (target.height, target.width, 3).
 
-        Raises ImageError when it has another aspect ratio or shows too little.
+        Raises ImageError when it has another aspect ratio or shows too little of the target's view.
         """
         height, width = image.shape[:2]
         source, target = self.source, self.target
         self.check(width, height)
         ratio = target.focal_px / (source.focal_px * height / source.height)
-        if ratio < 1:  # averaged first: sampling alone would skip pixels
+        if ratio < 1:  # reduced by averaging first, because sampling alone would skip pixels
             size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         seen = source.resized(image.shape[1], image.shape[0])
@@ -129,13 +130,13 @@ class Rectification:
                 )
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, K; columns: `split_outputs`) for rectified images, converted to the
-        car of the source.
+        """A model's outputs (N, K) for rectified images, converted to the car that carries the
+        source camera.
 
-        Distances change, and so do their standard deviations, which include the standard deviation
-        of the source's height; absent distances stay absent. The angle does not change, because the
-        rectified view looks along the car. All images of a camera that is too high or too low
-        (`SEEN_LANES_M`) are out of distribution.
+        Distances and their standard deviations change; the latter then include the standard
+        deviation of the source's height. Absent distances stay absent. The angle does not change,
+        because the rectified view looks along the car. All images of a camera that is too high or
+        too low (`SEEN_LANES_M`) are out of distribution. `split_outputs` explains the K columns.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)
@@ -158,10 +159,10 @@ class Rectification:
         return changed
 
     def labels(self, distances: NDArray[np.float32], angle: NDArray[np.float32]) -> Metres:
-        """Targets of the distances (N, 5), m, for rectified images, NaN where absent.
+        """Targets of the distances for rectified images: (N, 5), m, NaN where absent.
 
-        `distances`, `angle` (N,) rad: labels of cars with the source camera. The inverse of
-        `outputs`.
+        `distances` (N, 5) m and `angle` (N,) rad are the labels of cars with the source camera.
+        `outputs` is the inverse conversion.
         """
         beside_camera = distances + _aside(self.source, angle)
         found: Metres = beside_camera / self.scale - _aside(self.target, angle)
@@ -181,8 +182,8 @@ def _aside(camera: CameraParameters, angle: NDArray[np.floating]) -> Metres:
 
 @lru_cache(maxsize=KEPT_MAPS)
 def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.float32]:
-    """The source's pixel (2, H, W) for each pixel of the target; `OUTSIDE` where it shows
-    nothing."""
+    """Column and row (2, H, W), px, of the source's pixel for each pixel of the target; `OUTSIDE`
+    where the source shows nothing."""
     columns, rows = np.meshgrid(np.arange(target.width), np.arange(target.height))
     rays = target.rays(np.column_stack([columns.ravel(), rows.ravel()]))
     places = rays @ target.rotation() + (source.x, source.y, source.z)
@@ -194,7 +195,8 @@ def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.floa
 def _fixed_maps(
     source: CameraParameters, target: CameraParameters
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """`_maps` as fixed-point maps of OpenCV."""
+    """The source's pixel for each pixel of the target, as the fixed-point maps (H, W, 2) and (H, W)
+    of cv2.remap."""
     u, v = _maps(source, target)
     coarse, fine = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
@@ -202,8 +204,8 @@ def _fixed_maps(
 
 @lru_cache(maxsize=KEPT_MAPS)
 def shown_shares(source: CameraParameters, target: CameraParameters) -> tuple[float, float, float]:
-    """Shares of the target's rows, of its columns, and of its rows below a level road's horizon, of
-    which the source shows a part."""
+    """Share of the target's rows of which the source shows a part; the same share of its columns,
+    and of its rows below the horizon of a level road."""
     u, v = _maps(source, target)
     inside = (u >= -0.5) & (u <= source.width - 0.5) & (v >= -0.5) & (v <= source.height - 0.5)
     rows, columns = inside.any(1), inside.any(0)

@@ -1,6 +1,6 @@
-"""The reference engine: the network in torch, float32, from which the served graph is converted.
+"""The reference engine, which runs the network in torch in float32.
 
-The only module of `mtlnet.inference` that imports torch.
+This is the only module of `mtlnet.inference` that imports torch.
 """
 
 from pathlib import Path
@@ -46,7 +46,8 @@ class TorchEngine:
         return result
 
     def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Outputs (B, K; columns: `split_outputs`) for images (B, H, W, 3)."""
+        """Outputs (B, K) for uint8 images (B, H, W, 3);
+        `mtlnet.inference.prediction.split_outputs` explains the K columns."""
         device = next(self.served.parameters()).device
         with torch.inference_mode():
             parts = [
@@ -57,7 +58,8 @@ class TorchEngine:
 
 
 def load_served(run: Path, card: ModelCard) -> ServedNetwork:
-    """The network of a run and its head. Raises ModelError when a file is missing or damaged."""
+    """The network of a run with its uncertainty head, if the model has one. Raises ModelError when
+    a file is missing or damaged."""
     has_head = card.uncertainty is not None
     check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
     head = read_uncertainty_head(run) if has_head else None
@@ -65,7 +67,8 @@ def load_served(run: Path, card: ModelCard) -> ServedNetwork:
 
 
 def convert_run(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run that has no graph. Raises ModelError as `load_served`."""
+    """The OpenVINO model of a run, converted from its weights. Raises ModelError when a file is
+    missing or damaged."""
     served = load_served(run, card)
     return build_graph(served.network, served.head)
 

@@ -1,7 +1,8 @@
-"""The rounds of a training as a model's card has them: seeds as ranges, names as a digest.
+"""The entries of a model's card about the rounds of its training: seeds as ranges, names as a
+digest.
 
-The card of format 5, and the `config.json` of runs from that time, list every seed and every name;
-`shortened` reads both forms.
+A card of format 5, and a `config.json` written at the time of that format, list every seed and
+every name; `shortened` accepts both forms.
 """
 
 import hashlib
@@ -14,10 +15,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Seeds:
-    """A set of seeds of rounds. The seeds of a collection are consecutive."""
+    """A set of seeds of rounds, stored as ranges, because the seeds of a collection are
+    consecutive."""
 
     ranges: tuple[range, ...]
-    """Disjoint, in order, with a gap between two of them."""
+    """Disjoint ranges in ascending order, with a gap between neighbours."""
 
     @staticmethod
     def of(seeds: Iterable[int]) -> "Seeds":
@@ -26,7 +28,8 @@ class Seeds:
 
     @staticmethod
     def read(entry: Mapping[str, Any] | Iterable[int]) -> "Seeds":
-        """The seeds of a card's entry, or a list of them. Raises ValueError for a damaged entry."""
+        """The seeds in `entry`: the result of `Seeds.entry`, or a list of seeds (format 5). Raises
+        ValueError for a damaged entry."""
         if not isinstance(entry, Mapping):
             return Seeds.of(entry)
         seeds = _merged(_range(text) for text in entry["ranges"].split())
@@ -63,7 +66,7 @@ def _range(text: str) -> range:
 
 
 def _merged(parts: Iterable[range]) -> Seeds:
-    """The numbers of these ranges, which may overlap."""
+    """The set of all seeds in `parts`, which may overlap."""
     merged: list[range] = []
     for part in sorted(parts, key=lambda part: part.start):
         if merged and part.start <= merged[-1].stop:
@@ -75,15 +78,15 @@ def _merged(parts: Iterable[range]) -> Seeds:
 
 def names_entry(names: Iterable[str]) -> dict[str, Any]:
     """The entry of a card for names of rounds: their number, and the SHA-256 of the sorted names as
-    JSON. It identifies a set of rounds that someone else can list."""
+    JSON. Anyone who has a list of names can check whether it is the same set of rounds."""
     ordered = sorted(names)
     digest = hashlib.sha256(json.dumps(ordered).encode()).hexdigest()
     return {"count": len(ordered), "sha256": digest}
 
 
 def shortened(about: Mapping[str, Any]) -> dict[str, Any]:
-    """A card's description of training data, or of the fit of the uncertainty head, without lists
-    of rounds. Raises ValueError, KeyError or TypeError for a damaged one."""
+    """A card's description of training data, or of the fit of the uncertainty head, with lists of
+    rounds replaced by short entries. Raises ValueError, KeyError or TypeError if it is damaged."""
     short = dict(about)
     if "seeds" in about:
         short["seeds"] = Seeds.read(about["seeds"]).entry()

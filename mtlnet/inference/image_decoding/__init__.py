@@ -1,2 +1,1 @@
-"""Decoding of images from untrusted sources: structure and limits are checked before pixels are
-decoded."""
+"""Decodes images from untrusted sources; checks structure and limits before pixels are decoded."""

@@ -1,4 +1,4 @@
-"""Size and orientation of an AVIF, from the properties of its primary item.
+"""Reads size and orientation of an AVIF image from the properties of its primary item.
 
 Sources: ISO/IEC 14496-12 (boxes), 23008-12 (HEIF), 23000-22 (MIAF: `irot` rotates, then `imir`
 mirrors; an orientation in EXIF is ignored).
@@ -15,7 +15,8 @@ MAX_BOXES = 10_000
 
 
 def read_header(body: bytes) -> tuple[int, int, int]:
-    """Width and height in px as stored, and the orientation, 1 to 8. Raises ImageError."""
+    """Width and height in px as stored, and the EXIF orientation, 1 to 8, of an AVIF file. Raises
+    ImageError for an incomplete header."""
     try:
         return _primary(memoryview(body))
     except (IndexError, KeyError):
@@ -36,7 +37,7 @@ def _primary(body: memoryview) -> tuple[int, int, int]:
 
 
 def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Type and content of each box in `data`."""
+    """Yields type and content of each box in `data`."""
     at = 0
     for _ in range(MAX_BOXES):
         if at + 8 > len(data):
@@ -52,7 +53,7 @@ def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _associations(ipma: memoryview, item: int) -> list[int]:
-    """Numbers, from 1, of the properties of an item; 0: no property."""
+    """Numbers, from 1, of the properties of an item in an `ipma` box; 0 stands for no property."""
     id_bytes, step = 4 if ipma[0] else 2, 2 if ipma[3] & 1 else 1
     at = 8
     for _ in range(min(_number(ipma, 4, 4), MAX_BOXES)):

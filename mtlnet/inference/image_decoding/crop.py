@@ -1,8 +1,8 @@
-"""The part of an image that shows the field of view of the model's camera (pinhole, centred).
+"""Finds the part of an image that shows the field of view of the model's camera (pinhole, centred).
 
-A model is trained with one camera: a stretched image, or one of another field of view, would give
-wrong distances and angles without any error message. So a wider image is cropped to the camera's
-field of view, and a narrower one is refused.
+A model is trained with one camera. A stretched image, or an image with another field of view, would
+give wrong distances and angles without any error message. So a wider image is cropped to the
+camera's field of view, and a narrower image is refused.
 """
 
 from dataclasses import dataclass
@@ -27,9 +27,10 @@ class Box:
 def crop_box(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None = None
 ) -> Box | None:
-    """The part of a width x height image that `view` shows; None: the whole image.
+    """The part of an image of `width` x `height` px that the camera `view` shows; None for the
+    whole image.
 
-    `fov_y_deg`: vertical field of view of the image; None: the field of view of `view`. A pinhole
+    `fov_y_deg`: vertical field of view of the image, degrees; None: that of `view`. A pinhole
     camera of focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less
     than `view`.
     """

@@ -1,13 +1,13 @@
-"""Decodes image files to the model's input: limits, header, strict decoding, scaling.
+"""Decodes image files to the model's input: checks the limits and the header, decodes, scales.
 
 `mtlnet predict`, `train`, `evaluate` and `serve` use this module, so that all get the same pixels.
-The size is read from the header before decoding: a PNG of 31 KB can need 1.5 GB. The image is
-rotated upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop refers to the
+The size is read from the header before decoding, because a PNG of 31 KB can need 1.5 GB. The image
+is rotated upright by its orientation (EXIF; `eXIf` in a PNG); every size and crop refers to the
 upright image. A wider image is cropped to the model's field of view
-(`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, 16 bits are reduced to
-8.
+(`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, samples of 16 bits are
+reduced to 8.
 
-A service accepts JPEG and PNG (`read_header`, `decode_whole`). A file on this machine may be of
+A service accepts JPEG and PNG (`read_header`, `decode_whole`). A file on this machine can be of
 another kind and is limited only by memory (`read_whole_image`, `decode_file`).
 """
 
@@ -36,24 +36,25 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 MAX_FILE_BYTES = 1 << 30
-MAX_FILE_PIXELS = 256_000_000  # in a file of this machine: 0.8 GB; the largest sensors have 200
+# Limit for a file on this machine, 0.8 GB of pixels; the largest sensors have 200 million.
+MAX_FILE_PIXELS = 256_000_000
 MIN_SIDE_PX, MAX_SIDE_PX, MAX_PIXELS = 16, 4096, 8_400_000
 MAX_SCANNED_PX = 100_000_000  # pixels times scans of a JPEG: ten scans of the largest image
 LATE_CHECK_BYTES = 1 << 18  # larger JPEG files are checked by `decode_whole`
-# On one core at 2.6 GHz: 84 ns per pixel of a PNG with 64 bits per pixel, 10 of a baseline JPEG, 15
-# of one with ten scans.
+# Measured on one core at 2.6 GHz, ns per pixel: 84 for a PNG with 64 bits per pixel, 10 for a
+# baseline JPEG, 15 for a JPEG with ten scans.
 PNG_NS_PER_BIT, PNG_NS_PER_BYTE, JPEG_NS, SCAN_NS, PROGRESSIVE_SCANS = 1.4, 2.0, 10.0, 1.0, 10
 TURN_NS = 6.0  # time to rotate a pixel
 MAX_SEQUENTIAL_SCANS = 4  # one for each component
-MAX_TRAILING_BYTES = 64  # padding of some cameras; more could be another file
+MAX_TRAILING_BYTES = 64  # some cameras add padding; more bytes could be another file
 
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """Size of the upright image, px; `png_header` is set for a PNG.
+    """Header of an image: `width` and `height` of the upright image, px.
 
-    `scans`: number of scans of a JPEG, or the usual number of such a JPEG if it was not `checked`.
-    `orientation`: as in EXIF.
+    `png_header` is set for a PNG. `scans`: number of scans of a JPEG; if the JPEG is not `checked`,
+    the usual number for its kind. `orientation`: as in EXIF, 1 to 8.
     """
 
     width: int
@@ -65,7 +66,7 @@ class ImageHeader:
 
     @property
     def decode_ms(self) -> float:
-        """Estimated time to decode it on one core, ms."""
+        """Estimated time to decode the image on one core, ms."""
         if (found := self.png_header) is not None:
             per_pixel_ns = PNG_NS_PER_BIT * max(8, found.pixel_bits)
             per_pixel_ns += PNG_NS_PER_BYTE * found.file_bytes / (self.width * self.height)
@@ -88,7 +89,7 @@ def read_whole_image(path: Path) -> NDArray[np.uint8]:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Add the file's name to an ImageError."""
+    """Add the file's name to an ImageError that is raised within the context."""
     try:
         yield
     except ImageError as error:
@@ -107,9 +108,9 @@ def _read_file(path: Path) -> bytes:
 
 
 def decode_file(body: bytes) -> NDArray[np.uint8]:
-    """The image in a file or recording of this machine: uint8 RGB, upright (H, W, 3).
+    """The image in the bytes `body` of a file on this machine: uint8 RGB, upright (H, W, 3).
 
-    Raises ImageError.
+    Raises ImageError for an image that cannot be used.
     """
     if body.startswith(png.SIGNATURE):
         header = png.read_header(body)
@@ -131,7 +132,7 @@ def decode_file(body: bytes) -> NDArray[np.uint8]:
 
 
 def check_file_size(width: int, height: int) -> None:
-    """Raise ImageError unless an image of that size (px) can be read from this machine."""
+    """Raise ImageError unless a file on this machine may have an image of this size (px)."""
     if min(width, height) < MIN_SIDE_PX or width * height > MAX_FILE_PIXELS:
         raise ImageError(
             Fault.SIZE,
@@ -141,9 +142,10 @@ def check_file_size(width: int, height: int) -> None:
 
 
 def read_header(body: bytes) -> ImageHeader:
-    """The header of an image, checked against the limits of every camera before decoding.
+    """The header of an image sent to the service, checked against the service's limits.
 
-    Takes a few ms at most; slower checks are left to `decode_whole`. Raises ImageError.
+    This takes at most a few ms; slower checks are left to `decode_whole`. Raises ImageError for an
+    image that is not accepted.
     """
     if body.startswith(png.SIGNATURE):
         found = png.read_header(body)
@@ -167,7 +169,8 @@ def _upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
 
 def _inspect_jpeg(body: bytes) -> ImageHeader:
     is_large = len(body) > LATE_CHECK_BYTES
-    # First, because the decoder may take 20 ms for many segments or a large colour profile.
+    # The head is read first, because the decoder can take 20 ms for many segments or a large
+    # colour profile.
     head = jpeg.read_head(body) if is_large else None
     width, height, colours = _jpeg_size(body if head is None else head.description)
     if colours not in ("Gray", "YCbCr", "RGB"):
@@ -193,7 +196,8 @@ def _jpeg_size(body: bytes) -> tuple[int, int, str]:
 
 
 def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
-    """The structure of a JPEG, after checks. Raises ImageError."""
+    """The structure of a JPEG of `width` x `height` px. Raises ImageError for a damaged JPEG, bytes
+    after the image, or too many scans."""
     structure = jpeg.read_structure(body)
     check_trailing(len(body) - structure.length)
     if structure.scans * width * height > MAX_SCANNED_PX:
@@ -206,8 +210,8 @@ def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
 
 
 def _check_late(body: bytes, header: ImageHeader) -> None:
-    """Make the checks that `read_header` left out. Raises ImageError, also where its estimate was
-    too low."""
+    """Make the checks that `read_header` left out. Raises ImageError when the JPEG has more scans
+    than `header` assumes, or is otherwise not accepted."""
     scans = _check_jpeg(body, header.width, header.height).scans
     if header.scans == 1 and scans > MAX_SEQUENTIAL_SCANS:
         raise ImageError(
@@ -228,7 +232,7 @@ def check_trailing(count: int) -> None:
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise ImageError unless an image of that size (px) is within the limits."""
+    """Raise ImageError unless an image of this size (px) is within the service's limits."""
     sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
     if not sides or width * height > MAX_PIXELS:
         raise ImageError(
@@ -239,7 +243,8 @@ def check_size(width: int, height: int) -> None:
 
 
 def decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
-    """The image as uint8 RGB (header.height, header.width, 3). Raises ImageError."""
+    """The image as uint8 RGB (header.height, header.width, 3). Raises ImageError when it is damaged
+    or not accepted."""
     if header.png_header is not None:
         image = _decode_png(body, header.png_header)
     else:
@@ -259,7 +264,11 @@ def decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
 def crop_and_resize(
     image: NDArray[np.uint8], view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
-    """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3). Raises ImageError."""
+    """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3).
+
+    `fov_y_deg`: vertical field of view of the image, degrees; None: that of `view`. Raises
+    ImageError when the image shows less than `view`.
+    """
     box = crop_box(image.shape[1], image.shape[0], view, fov_y_deg)
     if box is not None:
         image = image[box.top : box.top + box.height, box.left : box.left + box.width]
@@ -279,7 +288,8 @@ def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
-    """As `_decode_jpeg`, also where a webcam's driver wrote zeros before the end marker."""
+    """Pixels of a JPEG (H, W, 3). A JPEG that cannot be decoded is tried again without zeros before
+    its end marker, which drivers of some webcams write."""
     try:
         return _decode_jpeg(body)
     except ImageError:
@@ -290,8 +300,8 @@ def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_png(body: bytes, header: png.PngHeader, *, limited: bool = True) -> NDArray[np.uint8]:
-    """Pixels of a PNG. `limited`: refuse too many chunks, and bytes after the image. Raises
-    ImageError."""
+    """Pixels (H, W, 3) of a PNG. `limited`: refuse too many chunks, and bytes after the image.
+    Raises ImageError when the PNG is damaged or refused."""
     checked, end = png.critical_chunks(body, header, limited=limited)
     if limited:
         check_trailing(len(body) - end)

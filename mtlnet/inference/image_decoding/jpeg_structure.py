@@ -1,4 +1,4 @@
-"""The structure of a JPEG, read before decoding: its end, number of scans and orientation.
+"""Reads the structure of a JPEG before decoding: its end, number of scans and orientation.
 
 Sources: ITU-T T.81, annex B; CIPA DC-008 (Exif 3.0). The decoder stops at the end marker and
 ignores the following bytes; the end is determined here, so that a file appended to the image is
@@ -18,22 +18,23 @@ SIGNATURE = b"\xff\xd8\xff"
 END = b"\xff\xd9"
 SOS, EOI, APP0, APP1, APP14 = 0xDA, 0xD9, 0xE0, 0xE1, 0xEE
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15
-DESCRIBING = FRAMES | {SOS, EOI, APP0, APP14}  # all that state size and colours
+DESCRIBING = FRAMES | {SOS, EOI, APP0, APP14}  # the segments that state size and colours
 PROGRESSIVE_FRAMES = frozenset((0xC2, 0xC6, 0xCA, 0xCE))
-# In entropy-coded data FF 00 is a byte FF, FF D0 to D7 a restart marker, FF FF a fill byte.
+# Whether FF and this byte end entropy-coded data, in which FF 00 is a byte FF, FF D0 to D7 a
+# restart marker, FF FF a fill byte.
 ENDS_DATA = np.ones(256, np.bool_)
 ENDS_DATA[[0x00, *range(0xD0, 0xD8), 0xFF]] = False
-MAX_SCANS = 100  # a progressive JPEG has about ten; each costs a pass over all pixels
+MAX_SCANS = 100  # a progressive JPEG has about ten; the decoder reads all pixels for each scan
 MAX_SEGMENTS = 1_000
 WINDOW_BYTES = 1 << 18  # searched at once; other threads can run between two searches
 FIRST_BYTES = 1 << 16  # searched first, which is fastest for most images
 FILL = re.compile(rb"\xff+")
-END_OF_DATA = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # as `ENDS_DATA`
+END_OF_DATA = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # FF and a byte of `ENDS_DATA`
 
 
 @dataclass(frozen=True, slots=True)
 class JpegStructure:
-    """Length of a JPEG including its end marker, bytes; number of scans; orientation."""
+    """Length of a JPEG including its end marker, bytes; number of scans; orientation, 1 to 8."""
 
     length: int
     scans: int
@@ -42,9 +43,9 @@ class JpegStructure:
 
 @dataclass(frozen=True, slots=True)
 class JpegHead:
-    """The part before the first scan: whether the JPEG is progressive, and its orientation, 1 to 8.
+    """Content of a JPEG before its first scan: whether it is progressive, its orientation, 1 to 8.
 
-    `description`: a JPEG with only the segments before that scan that state size and colours.
+    `description`: a JPEG reduced to the segments before the first scan that state size and colours.
     """
 
     is_progressive: bool
@@ -53,7 +54,8 @@ class JpegHead:
 
 
 def read_head(body: bytes) -> JpegHead:
-    """The part before the first scan; takes at most 3 ms. Raises ImageError."""
+    """The content of a JPEG before its first scan, read in at most 3 ms. Raises ImageError for a
+    damaged JPEG or too many segments."""
     at, frame, exif, kept = len(START), 0, None, [START]
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
@@ -72,9 +74,10 @@ def read_head(body: bytes) -> JpegHead:
 
 
 def read_structure(body: bytes) -> JpegStructure:
-    """The structure of the JPEG at the start of `body`. Raises ImageError.
+    """The structure of the JPEG at the start of `body`. Raises ImageError for a damaged JPEG, or
+    too many scans or segments.
 
-    Takes at most 3 ms per MiB, in steps of up to WINDOW_BYTES.
+    Takes at most 3 ms per MiB; other threads can run after each `WINDOW_BYTES`.
     """
     at, scans, exif = len(START), 0, None
     for _ in range(MAX_SEGMENTS):
@@ -118,9 +121,9 @@ def _find_marker(body: bytes, at: int) -> int:
     first = END_OF_DATA.search(body, at, at + FIRST_BYTES)
     if first is not None:
         return first.start()
-    # One byte again: a marker may cross the end of the searched part.
+    # The last byte is searched again, because a marker may cross the end of the searched part.
     for start in range(at + FIRST_BYTES - 1, len(body), WINDOW_BYTES):
-        # One byte more: a marker may cross the end of a window.
+        # A window has one byte of the next, because a marker may cross the end of a window.
         count = min(WINDOW_BYTES + 1, len(body) - start)
         window = np.frombuffer(body, np.uint8, count, start)
         escapes = np.flatnonzero(window[:-1] == 0xFF)
@@ -139,7 +142,7 @@ def _length(body: bytes, at: int) -> int:
 
 def _exif(body: bytes, at: int, length: int) -> bytes | None:
     """The Exif block in an APP1 segment whose length is at offset `at`; None for other content."""
-    is_exif = body.startswith(EXIF_MARK[:-1], at + 2)  # the byte behind the mark is padding
+    is_exif = body.startswith(EXIF_MARK[:-1], at + 2)  # the last byte of the mark is padding
     return body[at + 2 + len(EXIF_MARK) : at + length] if is_exif else None
 
 

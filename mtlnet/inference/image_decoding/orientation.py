@@ -1,7 +1,8 @@
-"""The orientation of an image, stored in the tag Orientation of EXIF and TIFF, and its correction.
+"""Reads the orientation of an image from the tag Orientation of EXIF and TIFF, and corrects it.
 
 Sources: CIPA DC-008 (Exif 3.0), TIFF 6.0, BigTIFF. As in browsers, a damaged or invalid orientation
-counts as none, only the first directory is read (the next is the thumbnail's), and XMP is ignored.
+counts as upright, only the first directory is read (the next is the thumbnail's), and XMP is
+ignored.
 """
 
 import struct
@@ -23,21 +24,22 @@ OFFSETS = {42: ("I", 4), 43: ("Q", 8)}
 
 
 def swaps_sides(orientation: int) -> bool:
-    """Whether upright width and height are the stored height and width."""
+    """Whether the upright image has the stored height as its width."""
     return orientation >= 5
 
 
 def exif_orientation(exif: bytes) -> int:
-    """The orientation, 1 to 8, in an Exif block with or without its mark `Exif`."""
+    """The orientation, 1 to 8, in an Exif block with or without its mark `Exif`; 1 (upright) if the
+    block has none."""
     kind, value = read_tags(exif.removeprefix(EXIF_MARK)).get(ORIENTATION, (SHORT, NONE))
     return value if kind == SHORT and 1 <= value <= 8 else NONE
 
 
 def read_tags(block: bytes) -> dict[int, tuple[int, int]]:
-    """The first directory of a TIFF block: type and value by tag.
+    """The first directory of a TIFF block, as a dict from tag to (type, value).
 
-    The value is -1 where it is not a single SHORT or LONG. From a damaged block, as many tags as
-    can be read.
+    The value is -1 if it is not a single SHORT or LONG. Of a damaged block, the dict has the tags
+    that can be read.
     """
     order: Literal["little", "big"] = "little" if block.startswith(b"II") else "big"
     version = int.from_bytes(block[2:4], order)

@@ -1,8 +1,8 @@
-"""Image files of this machine other than JPEG and PNG. Kinds that OpenCV reads are decoded; for
+"""Decodes image files of this machine other than JPEG and PNG, if OpenCV reads their kind; for
 other kinds the error message names the kind.
 
 The kind of a file is determined by its first bytes, not its name. Its size is read from its header
-before OpenCV decodes it, because OpenCV allocates what the header states. If a file has several
+before OpenCV decodes it, because OpenCV allocates memory for the stated size. If a file has several
 pictures, the first is read.
 """
 
@@ -32,33 +32,32 @@ SUFFIXES = (
 IMAGE_WIDTH, IMAGE_HEIGHT = 256, 257  # TIFF tags
 NEW_SUBFILE_TYPE, DNG_VERSION = 254, 50706
 REDUCED = 1  # bit of NEW_SUBFILE_TYPE: a smaller copy of another image in the file
-FIRST_BYTES = 1024  # that determine the kind of a file
+FIRST_BYTES = 1024  # number of bytes that determine the kind of a file
 
 Header = tuple[int, int, int]
-"""Width and height in px as decoded by OpenCV, and the orientation, 1 to 8, that remains to be
-corrected."""
+"""Width and height in px of the picture that OpenCV decodes, and its orientation, 1 to 8, which
+`decode` corrects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of image file: `signature` matches its first bytes; `suffix` is the one that OpenCV
-    knows."""
+    """A kind of image file. `signature` matches the first bytes of a file; `suffix` is the name
+    suffix by which OpenCV identifies the kind."""
 
     name: str
     suffix: str
     signature: re.Pattern[bytes]
     read_header: Callable[[bytes], Header]
-    """Reads the header. Raises ImageError, struct.error or IndexError for a damaged one."""
+    """Reads the header. Raises ImageError, struct.error or IndexError for a damaged header."""
 
 
 def find_kind(body: bytes) -> Kind | None:
-    """The kind of image file that `body` holds; None for a kind that is not read."""
+    """The kind of image file that `body` holds; None for a kind that OpenCV does not decode."""
     return next((kind for kind in KINDS if kind.signature.match(body[:FIRST_BYTES])), None)
 
 
 def describe(body: bytes) -> str:
-    """What the bytes are instead of a JPEG or PNG, and what to do about it, as text of a
-    message."""
+    """Text of a message about bytes that are not a JPEG or PNG: what they are, and advice."""
     if (kind := find_kind(body)) is not None:
         return f"a {kind.name} image; {SAVE}"
     first = body[:FIRST_BYTES]
@@ -69,7 +68,7 @@ def describe(body: bytes) -> str:
 
 
 def read_header(body: bytes, kind: Kind) -> Header:
-    """The header of a file of this kind. Raises ImageError."""
+    """The header of a file of this kind. Raises ImageError for a damaged or unsupported file."""
     try:
         return kind.read_header(body)
     except (struct.error, IndexError):
@@ -79,7 +78,8 @@ def read_header(body: bytes, kind: Kind) -> Header:
 
 
 def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
-    """The first picture, upright, as uint8 RGB (H, W, 3). Raises ImageError."""
+    """The first picture of a file, upright, as uint8 RGB (H, W, 3). Raises ImageError when OpenCV
+    cannot decode it."""
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(body, np.uint8), flags)
@@ -98,8 +98,8 @@ def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
 
 
 def _read_webp(body: bytes) -> Header:
-    """Source: RFC 9649. The first chunk is a lossy or lossless picture, or describes the following
-    chunks."""
+    """The header of a WebP file (RFC 9649), whose first chunk is a lossy or lossless picture, or
+    describes the following chunks."""
     kind, data = body[12:16], body[20:30]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 6)
@@ -112,7 +112,7 @@ def _read_webp(body: bytes) -> Header:
 
 
 def _riff_chunk(body: bytes, wanted: bytes) -> bytes:
-    """Content of the first chunk of type `wanted`; empty without one."""
+    """Content of the first chunk of type `wanted` in a RIFF file; empty if there is none."""
     at = 12
     while at + 8 <= len(body):
         size = int.from_bytes(body[at + 4 : at + 8], "little")
@@ -130,7 +130,8 @@ def _read_bmp(body: bytes) -> Header:
 
 
 def _read_tiff(body: bytes) -> Header:
-    """Header of a TIFF; OpenCV rotates a TIFF upright itself, whatever the flags."""
+    """The header of a TIFF file. The orientation is always 1, because OpenCV itself rotates a TIFF
+    upright, whatever the flags."""
     tags = read_tags(body)
     if DNG_VERSION in tags or tags.get(NEW_SUBFILE_TYPE, (0, 0))[1] & REDUCED:
         raise ImageError(

@@ -1,8 +1,9 @@
-"""The structure of a PNG, checked before decoding: header, checksums, amount of pixel data.
+"""Checks the structure of a PNG before decoding: header, checksums, amount of pixel data.
 
 Source: PNG specification, third edition (W3C). Decoders differ in the damage that they accept and
-in their use of ancillary chunks (orientation, animation, colour profiles). `critical_chunks` checks
-the critical chunks and removes the ancillary ones; the orientation is read by `find_exif`.
+in their use of ancillary chunks (orientation, animation, colour profiles). Therefore
+`critical_chunks` checks the critical chunks and removes ancillary chunks; `find_exif` finds the
+orientation.
 """
 
 import struct
@@ -12,7 +13,8 @@ from dataclasses import dataclass
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# Encoders write chunks of at least 8 KiB. The check of a chunk takes at least a microsecond.
+# Limit of the number of chunks: FREE_CHUNKS, and one for each BYTES_A_CHUNK of the file. Encoders
+# write chunks of at least 8 KiB. The check of a chunk takes at least a microsecond.
 FREE_CHUNKS, BYTES_A_CHUNK = 256, 1024
 CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
@@ -31,8 +33,7 @@ FILTERS = 5
 
 @dataclass(frozen=True, slots=True)
 class PngHeader:
-    """Header of a PNG (IHDR): size in px, bits per sample and per pixel, and whether it is
-    interlaced.
+    """Header of a PNG (IHDR): size in px, bits per pixel, and whether it is interlaced.
 
     `file_bytes`: size of the whole file, whose checksums are verified.
     """
@@ -44,7 +45,8 @@ class PngHeader:
     file_bytes: int
 
     def passes(self) -> list[tuple[int, int]]:
-        """Number of rows, and bytes per row without the filter byte, of each pass."""
+        """Number of rows, and bytes per row without the filter byte, of each interlacing pass; one
+        pass if the PNG is not interlaced."""
         steps = PASSES if self.interlaced else ((0, 0, 1, 1),)
         sizes = []
         for column, row, across, down in steps:
@@ -56,7 +58,8 @@ class PngHeader:
 
 
 def read_header(body: bytes) -> PngHeader:
-    """The header of a PNG that starts with SIGNATURE. Raises ImageError."""
+    """The header of a PNG that starts with SIGNATURE. Raises ImageError for a header that PNG does
+    not define."""
     start = len(SIGNATURE)
     if len(body) < start + 25 or body[start : start + 8] != b"\x00\x00\x00\x0dIHDR":
         raise ImageError(Fault.DAMAGED, "the PNG does not begin with IHDR; save it anew")
@@ -75,7 +78,7 @@ def read_header(body: bytes) -> PngHeader:
 
 
 def find_exif(body: bytes, *, limited: bool = True) -> bytes:
-    """Content of the first `eXIf` chunk; empty without one. Its checksum is not verified.
+    """Content of the first `eXIf` chunk; empty if there is none. Its checksum is not verified.
 
     `limited`: search only as many chunks as `critical_chunks` allows.
     """
@@ -96,9 +99,10 @@ def _most_chunks(body: bytes, limited: bool) -> int:
 
 
 def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> tuple[bytes, int]:
-    """The PNG reduced to header, palette and pixel chunks, all checked, and its end in `body`.
+    """The PNG reduced to its checked critical chunks (header, palette, pixels, end), and the offset
+    of the PNG's end in `body`.
 
-    `limited`: refuse a PNG with too many chunks. Raises ImageError.
+    `limited`: refuse a PNG with too many chunks. Raises ImageError for a damaged or refused PNG.
     """
     kept: list[bytes | memoryview] = [SIGNATURE]
     pixels: list[memoryview] = []
@@ -125,7 +129,8 @@ def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> 
 
 
 def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:
-    """End and type of the chunk at offset `at`; its checksum is verified."""
+    """End offset and type of the chunk at offset `at`. Raises ImageError for a truncated chunk or a
+    wrong checksum."""
     if at + 12 > len(view):
         raise ImageError(
             Fault.DAMAGED,
