@@ -1,1 +1,2 @@
-"""`mtlnet predict`: track features of images, films and recorded rounds, as tables and pictures."""
+"""The command `mtlnet predict`, which writes the track features of images, films and recordings as
+tables, pictures, films or recordings."""

@@ -1,7 +1,7 @@
 """Finds the camera that took the pictures of a source, for `mtlnet predict`.
 
-The camera is the first of these that is known: the camera that the user gives, the camera that a
-recording states, the camera estimated from the pictures of the drive (`mtlnet.calibration`).
+The camera that the user gives has precedence, then the camera that a recording states, then the
+camera estimated from the pictures of the drive (`mtlnet.calibration`).
 """
 
 from dataclasses import replace
@@ -25,12 +25,12 @@ from trackfeatures.errors import UserError
 FILM_S = 60.0
 """Duration at the start of a film from which its camera is estimated, s."""
 FIRST_S, AGAIN = 15.0, 2.0
-"""The camera of a stream is estimated after this time, s, and again each time that this factor
-times the last interval has passed."""
+"""The camera of a stream is estimated `FIRST_S` seconds after its first picture, and again whenever
+the time since the first picture has grown by the factor `AGAIN`."""
 
 
 class _ModelsOwn(Exception):
-    """The pictures have the size of the model's own camera."""
+    """Raised for pictures of the size of the model's own camera, whose camera is not estimated."""
 
 
 def with_lens(
@@ -39,8 +39,8 @@ def with_lens(
     """The source with its lens: `given`, else the lens that a recording states, else with
     `calibrate` a lens estimated from the pictures of the film or stream.
 
-    If a field of view is given, `calibrate` estimates the mount. `note`: called with a line about
-    what was found.
+    If `given` is a field of view in degrees, `calibrate` estimates only the mount. `note` is called
+    with a line about the camera that was found.
     """
     if isinstance(given, Rectification) or source.problem or source.kind is SourceKind.ROUND:
         return replace(source, lens=given)
@@ -56,7 +56,8 @@ def with_lens(
 
 
 def _stated(source: Source, model: CameraParameters, note: Note) -> Source | None:
-    """The recording with the camera that it states; None if it states none."""
+    """The recording with the lens of the camera that it states; None if it states no usable
+    camera."""
     from mtlnet.sources.recordings.cameras import is_models
     from mtlnet.sources.recordings.recording import Recording
 
@@ -72,13 +73,14 @@ def _stated(source: Source, model: CameraParameters, note: Note) -> Source | Non
 
 
 def _lens(size: tuple[int, int], model: CameraParameters, fov_y_deg: float | None) -> KnownLens:
+    """Lens of pictures of `size` (width, height), px. Raises _ModelsOwn for the model's size."""
     if size == (model.width, model.height):
         raise _ModelsOwn
     return find_lens(size, model, fov_y_deg=fov_y_deg)
 
 
 def _of_film(source: Source, model: CameraParameters, given: float | None, note: Note) -> Lens:
-    """The film's camera as its first minute shows it, else the model's or the one `given`."""
+    """The lens estimated from the film's first `FILM_S` seconds; `given` if that fails."""
     try:
         drive = calibrate_film(
             source.path, lambda size: _lens(size, model, given), longest_s=FILM_S
@@ -100,8 +102,8 @@ def _rectification(
     name: str,
     note: Note,
 ) -> Rectification:
-    """Rectification of an estimated camera. Raises ImageError where it shows too little of the
-    model's view."""
+    """Rectification from an estimated camera to the model's. Raises ImageError when the camera
+    shows too little of the model's view in the first picture of `shown`."""
     lens = Rectification(found.camera, model)
     for picture in shown[:1]:
         lens.image(picture)
@@ -115,8 +117,8 @@ def _failed(name: str, error: Exception) -> str:
 
 
 class DriveLens:
-    """Finds the camera of a stream while it runs; until then it is the model's or the one
-    `given`."""
+    """Finds the camera of a stream while its pictures arrive. Until then the lens is `given`, or
+    None for the model's camera."""
 
     def __init__(self, name: str, model: CameraParameters, given: float | None, note: Note) -> None:
         self._name, self._model, self._given, self._note = name, model, given, note
@@ -127,7 +129,7 @@ class DriveLens:
         self._done = False
 
     def at(self, picture: Picture) -> Lens:
-        """The lens for this picture, the next one in order."""
+        """The lens for `picture`. Must be called for each picture in order."""
         if not self._done and picture.image is not None and picture.time_s is not None:
             self._take(picture.image, picture.time_s, picture.bgr)
         return self._lens

@@ -1,7 +1,7 @@
-"""Writes predictions as an MCAP file for Foxglove: pictures, features, markings drawn over them.
+"""Writes predictions as an MCAP file for Foxglove: pictures, markings drawn over them, features.
 
     /camera/front               foxglove.CompressedImage: the picture in the model's view
-    /camera/front/calibration   foxglove.CameraCalibration of that view, where it changes
+    /camera/front/calibration   foxglove.CameraCalibration of that view, whenever the view changes
     /camera/front/annotations   foxglove.ImageAnnotations: the predicted markings, and the features
     /features                   driverview.Prediction, JSON: the columns of a table of `predict`
 
@@ -37,14 +37,14 @@ FEATURES = "/features"
 SCHEMA = "driverview.Prediction"
 CODEC = "jpeg"
 SINCE_1970_S = 1e8
-"""Times above this, s, are since 1970 (recordings, streams); smaller times are since the start of a
-film."""
+"""A time above this limit, s, is a time since 1970 (recordings, streams); a smaller time is a time
+since the start of a film or round."""
 ORANGE = Color(**dict(zip("rgb", (c / 255 for c in PREDICTION_COLOUR), strict=True)), a=1.0)
 
 
 class McapWriter:
-    """Writes each image and its prediction as messages with one log time; close it to complete the
-    file."""
+    """Writes each image and its prediction as messages with one log time. The end of the context
+    completes the file."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
         self._path, self._model = path, camera
@@ -104,9 +104,10 @@ class McapWriter:
             raise
 
     def _log_time(self, time_s: float | None) -> int:
-        """Log time in ns since 1970; an image without a time follows one step after the last.
+        """Log time in ns since 1970 of an image with the time `time_s`, s. An image without a time
+        follows one frame interval after the last image.
 
-        Consecutive films and rounds, whose times all start at 0, are placed one after another.
+        The times of each film and round start at 0; consecutive ones are placed one after another.
         """
         if time_s is None:
             time = self._last_ns + self._step_ns if self._last_ns else topics.EPOCH_NS
@@ -132,8 +133,9 @@ class McapWriter:
 def annotations(
     item: SourceImage, prediction: Prediction, view: CameraParameters, time: Any
 ) -> bytes:
-    """The predicted markings as polylines over the image, a round's labels too, and the features as
-    text. Without labels the lines are straight, because the curvature is not predicted."""
+    """The serialised `ImageAnnotations` of an image: predicted markings and a round's labels as
+    polylines, and the features as text. Without labels the lines are straight, because the
+    curvature is not predicted."""
     message = ImageAnnotations(timestamp=time)
     truth, curvature = item.truth, item.truth.curvature if item.truth else 0.0
     styles: list[tuple[Distances, float, Any]] = [

@@ -1,7 +1,7 @@
-"""`mtlnet predict`: predicts the features of the images of any source, and writes them.
+"""Predicts the features of the images of any source and writes them, for `mtlnet predict`.
 
-Three threads share the work: one decodes, one runs the network, one draws and writes. Each keeps
-the order of images, so that answers and files do not depend on timing.
+Three threads share the work: one decodes, one runs the network, one draws and writes. Each thread
+keeps the order of the images, so that answers and files do not depend on timing.
 """
 
 import time
@@ -25,11 +25,12 @@ from runtime.cli import counted
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000
-"""Maximum number of results that are returned; files get all."""
+"""Maximum number of results that `predict_files` returns; all results are written to files."""
 
 
 class InputsLeftOut(UserError):
-    """Some inputs or images could not be used; `results` has the results of all other images."""
+    """Raised when some inputs or images could not be used; `results` has the results of the other
+    images, at most `KEPT_ROWS`."""
 
     def __init__(self, message: str, results: list[dict[str, Any]]) -> None:
         super().__init__(message)
@@ -49,17 +50,17 @@ def predict_files(
 ) -> list[dict[str, Any]]:
     """Predict the features of all images that `inputs` name (`mtlnet.sources.find.find_sources`).
 
-    Returns the results of the first `KEPT_ROWS` images; all are written to each of `outputs`
-    (`mtlnet.predict.writers.open_writer`), image by image. `lens`: the lens of all sources except
-    recorded rounds, which must be of the model's camera; None: the lens that is known for the
-    source, else the model's. `report`: called with the numbers of images done and in total. `note`:
-    called with a line about what is left out or found. `topic`: the topic to read from recordings.
-    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends a stream
-    normally.
+    Returns the results of the first `KEPT_ROWS` images; all results are written to each of
+    `outputs` (`mtlnet.predict.writers.open_writer`), image by image. `lens`: the lens of all
+    sources except recorded rounds, which must be of the model's camera; None: the lens that a
+    recording states or that is estimated, else the model's. `report`: called with the numbers of
+    images done and in total. `note`: called with a line about files that are left out and cameras
+    that are found. `topic`: the topic to read from recordings. `calibrate`: estimate the camera of
+    films and streams from their pictures. Ctrl-C ends a stream normally.
 
-    Raises InputsLeftOut, after all others are done, when an input or an image could not be used;
-    UserError at once for an invalid `lens`, and for outputs that cannot be written or are among the
-    files to read.
+    Raises InputsLeftOut, after all other images are done, when an input or an image could not be
+    used; UserError at once for an invalid `lens`, and for outputs that cannot be written or are
+    among the files to read.
     """
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
@@ -95,7 +96,8 @@ def predict_files(
 
 
 def answer(engine: Engine, item: SourceImage) -> Prediction:
-    """The features of a readable image, in metres at its own camera."""
+    """The features that `engine` predicts for an image that could be read, with distances in metres
+    at the image's own camera."""
     assert item.image is not None
     outputs = engine(item.image)
     if item.lens is not None:
@@ -109,7 +111,7 @@ def first_of(errors: list[str]) -> str:
 
 
 class _Answers:
-    """The answers so far, and the errors of unusable images."""
+    """Runs the engine on images; collects the results, and the errors of unusable images."""
 
     def __init__(self, engine: Engine, total: int, report: Callable[[int, int], None]) -> None:
         self._engine, self._total, self._report = engine, total, report
@@ -134,7 +136,8 @@ class _Answers:
             self._results.append(row)
 
     def finish(self) -> list[dict[str, Any]]:
-        """All answers. Raises InputsLeftOut."""
+        """The results of the first `KEPT_ROWS` images. Raises InputsLeftOut when an image could not
+        be used."""
         if not self._unusable:
             return self._results
         others = f"; {counted(self.used, 'image')} done" if self.used else ""
@@ -144,7 +147,8 @@ class _Answers:
 class _Writing:
     """Writes answers in order on its own thread.
 
-    An error there is raised by the next `write` or at the end; nothing is written after it.
+    The next `write`, or the end of the context, raises an error that occurred in this thread;
+    nothing is written after the error.
     """
 
     def __init__(self, writers: list[Writer]) -> None:
@@ -154,7 +158,7 @@ class _Writing:
         self._failed = False
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
-        """Write one answer soon; waits while more than `READ_AHEAD` earlier answers wait."""
+        """Queue one answer for writing; waits while more than `READ_AHEAD` answers are queued."""
         if self._writers:
             self._waiting.append(self._thread.submit(self._write, item, prediction))
         while self._waiting and (len(self._waiting) > READ_AHEAD or self._waiting[0].done()):

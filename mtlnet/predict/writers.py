@@ -1,8 +1,8 @@
 """Writers of the files of `mtlnet predict --out`: tables (.csv, .jsonl), a film (.mp4), a recording
 for Foxglove (.mcap) or pictures.
 
-Each row and frame is written at once, so that an interrupted command keeps what was done. Names
-that are not UTF-8 are written in tables as described in `runtime.files`.
+Each row and frame is written immediately, so that an interrupted command keeps its results so far.
+Names that are not UTF-8 are written in tables as described in `runtime.files`.
 """
 
 import csv
@@ -31,12 +31,13 @@ TEXT_HEIGHT = 64
 """Height of the text with the features below a picture, px."""
 TEXT_COLOUR = (235, 235, 235)
 MAX_STEM_BYTES = 200
-"""Maximum length of the part of a picture's file name from its image, bytes; a file name has at
+"""Maximum length, bytes, of an image's name within the file name of its picture; a file name has at
 most 255."""
 
 
 class Writer(Protocol):
-    """Writes images and predictions one by one; a context manager that closes its file."""
+    """Interface of a writer of images and predictions, one by one. The end of its context closes
+    the file."""
 
     def write(self, item: SourceImage, prediction: Prediction) -> None: ...
 
@@ -72,7 +73,8 @@ def require_other_file(path: Path, inputs: list[Path]) -> None:
 
 
 def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
-    """Features of one image as a flat row; None for what is absent, unknown or not predicted."""
+    """Features of one image as a flat row, in m and rad; None for a value that is absent, unknown
+    or not predicted."""
     std = prediction.std or {}
     row: dict[str, Any] = {"image": item.name, "time_s": item.time_s}
     for marking in tf.MARKINGS:
@@ -88,7 +90,7 @@ def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
 
 
 class TableWriter:
-    """Writes rows of `table_row` as CSV with a header, or as one JSON object per line."""
+    """Writes one row of features per image as CSV with a header, or as one JSON object per line."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -123,8 +125,8 @@ class TableWriter:
 
 
 class FilmWriter:
-    """Writes drawn frames as an MP4 film (MPEG-4), which is playable even if the command is
-    interrupted."""
+    """Writes frames with drawn markings as an MP4 film (MPEG-4), which is playable even if the
+    command is interrupted."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
         self._camera, self._film = camera, Mp4Writer(path, fps)
@@ -140,7 +142,8 @@ class FilmWriter:
 
 
 class PictureWriter:
-    """Writes drawn frames as PNG files named by a count from `0000` and the name of the image."""
+    """Writes frames with drawn markings as PNG files, named by a number from `0000` and the name of
+    the image."""
 
     def __init__(self, folder: Path, camera: CameraParameters) -> None:
         self._folder, self._camera, self._count = folder, camera, 0
