@@ -71,6 +71,7 @@ class ModelCard:
     files: dict[str, str]
     """SHA-256 of each file, in hex."""
     export_check: dict[str, float]
+    """Number of compared frames, and largest differences of the served graph from torch."""
     golden: tuple[float, ...]
     """Outputs (9,) of torch in float32 for the golden image (`mtlnet.inference.golden_image`)."""
     uncertainty: dict[str, Any] | None

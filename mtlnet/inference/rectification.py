@@ -60,7 +60,7 @@ class Rectification:
 
     @property
     def scale(self) -> float:
-        """Metres at the source per metre at the target."""
+        """Metres at the source per metre at the target, the ratio of the cameras' heights."""
         return self.source.height_above_road_m / self.target.height_above_road_m
 
     @property

@@ -29,7 +29,7 @@ radius. The bins have equal widths in the root."""
 
 
 class AuxiliaryHeads(nn.Module):
-    """The heads of the columns and of the curvatures, for a network with `size` last features."""
+    """The heads of the columns and of the curvatures. `size`: number of last shared features."""
 
     def __init__(self, plan: Architecture, size: int) -> None:
         super().__init__()

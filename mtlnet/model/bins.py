@@ -74,8 +74,8 @@ def bin_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
 def absent_in(coded: Tensor) -> Tensor:
     """Whether each distance of coded targets (B, 6) is absent: (B, 5) bool.
 
-    A label codes an absent marking as the inactive end of its range; a marking that is present
-    never reaches that value.
+    A label codes an absent marking as one end of its range (`inactive` in `trackfeatures.RANGES`);
+    a marking that is present never reaches that end.
     """
     ends = [span.inactive for span in _SPANS[:-1]]
     there = _numbers(ends, coded)
@@ -92,8 +92,8 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
     """Coded answers (B, 6): five distances and the angle, from the scores (B, 5, DISTANCE_BINS + 1)
     and (B, ANGLE_BINS).
 
-    A distance whose probability of absence exceeds `ABSENT_ABOVE` is coded as the inactive end of
-    its range, as in a label.
+    A distance whose probability of absence exceeds `ABSENT_ABOVE` has the code of an absent
+    marking, as in a label.
     """
     absent = absent_probabilities(distance)
     found = expectation(distance[:, :, :-1])  # in [0, 1] of the range

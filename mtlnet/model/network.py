@@ -81,7 +81,8 @@ class Network(nn.Module):
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Outputs (B, 9) float32 for images (B, 210, 280, 3), uint8 or normalised float."""
+        """Outputs (B, 9) float32, six coded values and three class scores, for images (B, 210, 280,
+        3), uint8 or normalised float."""
         return self.forward_heads(self.forward_features(images))
 
     def forward_features(self, images: Tensor) -> Tensor:
@@ -98,7 +99,7 @@ class Network(nn.Module):
         return grid
 
     def forward_heads(self, x: Tensor) -> Tensor:
-        """Outputs (B, 9) for last shared features (B, 256)."""
+        """Six coded values and three class scores (B, 9) for last shared features (B, 256)."""
         # float32 also under autocast: coded values differ little, and the heads are small.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()

@@ -23,7 +23,7 @@ TEXTURE_VALUES = CELL_VALUES + CENTRE_VALUES
 HALVES = 2  # upper and lower half of an image
 LIGHT_VALUES = PLANES * HALVES
 SQRT_EPSILON = 1e-6
-"""Added to a mean difference before the square root; the difference is 0 in a flat cell."""
+"""Added to a mean difference, which can be 0, before its square root."""
 LEVEL = 1 / 127.5  # difference of two successive uint8 colours on the scale [-1, 1]
 
 

@@ -53,8 +53,8 @@ def missing_end(path: Path) -> str:
 
 
 def unsupported_picture(path: Path) -> str:
-    """Why the pictures must not be used as they are stored (cropped, mirrored, stereoscopic); empty
-    if they can be."""
+    """A text about why the pictures must not be used as they are stored (cropped, mirrored,
+    stereoscopic); empty if they can be used."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(16)

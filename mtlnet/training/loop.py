@@ -101,7 +101,8 @@ def train_loop(
 
 
 def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
-    """Save a checkpoint in the first process. Raises UserError when a weight is not finite."""
+    """Save a checkpoint and return its path; processes other than the first do not save, and return
+    the run's folder. Raises UserError when a weight is not finite."""
     if not trainer.rank.is_first:
         return config.out
     if not all(bool(p.isfinite().all()) for p in trainer.network.parameters()):

@@ -44,7 +44,7 @@ PRETRAINED_FRAMES = 128
 restored in a finished model."""
 
 Finish = Callable[[TrainConfig, Trainer, TrainingData], None]
-"""Writes the finished model to the run's folder; called in the first process only."""
+"""A function that writes the finished model to the run's folder, called in the first process."""
 
 
 def run_training(

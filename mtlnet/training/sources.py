@@ -89,7 +89,7 @@ def open_training_data(
 def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "") -> TrainingData:
     """A user's own pictures, rectified to the camera of the model `card`.
 
-    `drives`: names of drives to leave out, separated by commas. Raises UserError without a model.
+    `drives`: names of drives to leave out, separated by commas. Raises UserError if `card` is None.
     """
     if card is None:
         raise UserError(

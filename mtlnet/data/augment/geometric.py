@@ -88,7 +88,7 @@ def lateral_shift_m(
 
 @lru_cache(maxsize=1)
 def rotations() -> NDArray[np.float64]:
-    """All rotations (ROTATIONS, 2): yaw to the left and pitch downwards, rad; number 0 is none."""
+    """Yaw to the left and pitch downwards, rad, of all rotations: (ROTATIONS, 2); row 0 is zero."""
     rng = np.random.default_rng(0)
     # Quantiles, because so few random values would represent the normal distribution badly.
     quantiles = (np.arange(1, ROTATIONS) - 0.5) / (ROTATIONS - 1)

@@ -37,7 +37,7 @@ def draw_colour_transforms(count: int, rng: np.random.Generator) -> NDArray[np.f
 
 
 def blur(image: NDArray[np.uint8], std_px: float) -> None:
-    """Blur the image by a Gaussian with a standard deviation in px."""
+    """Blur the image, in place, by a Gaussian with a standard deviation of `std_px`."""
     side = 2 * round(2 * std_px) + 1
     cv2.GaussianBlur(image, (side, side), std_px, dst=image)
 
@@ -59,6 +59,6 @@ def stored_noise(size: int) -> NDArray[np.uint8]:
 
 
 def compress(image: NDArray[np.uint8], quality: int) -> None:
-    """Compress the image as JPEG and decode it again."""
+    """Compress the image as JPEG of `quality` 0 to 100 and decode it again, in place."""
     file = simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality, "RGB", "420")
     simplejpeg.decode_jpeg(file, "RGB", buffer=image)

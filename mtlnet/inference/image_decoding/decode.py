@@ -186,7 +186,7 @@ def _inspect_jpeg(body: bytes) -> ImageHeader:
 
 
 def _jpeg_size(body: bytes) -> tuple[int, int, str]:
-    """Stored width and height, px, and colour space. Raises ImageError."""
+    """Stored width and height, px, and colour space. Raises ImageError for a damaged header."""
     try:
         # The decoder's own header reader, so that sizes cannot differ from the decoded image.
         height, width, colours, _ = simplejpeg.decode_jpeg_header(body)

@@ -171,7 +171,7 @@ def _topic(channel: Channel, schemas: dict[int, Schema], count: int) -> Topic:
 
 
 class RosBag:
-    """A bag that `rosbags` reads: sqlite3 files, or compressed."""
+    """A bag of sqlite3 files or compressed files, which `rosbags` reads."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

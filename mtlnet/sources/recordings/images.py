@@ -87,7 +87,7 @@ def _from_protobuf(data: bytes, schema: str) -> Any:
 
 
 def _from_json(data: bytes, schema: str) -> Any:
-    """A message in Foxglove's JSON: bytes in base64, times as {"sec", "nsec"}."""
+    """Parse a message in Foxglove's JSON, with bytes in base64 and times as {"sec", "nsec"}."""
     try:
         fields = json.loads(data)
         message = _message_type(schema)()

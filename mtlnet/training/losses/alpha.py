@@ -11,7 +11,7 @@ METHODS = ("fixed", "uncertainty", "dwa")
 
 
 class AlphaError(UserError):
-    """Task weights are missing, negative, not numbers, or all zero."""
+    """Raised for task weights that are missing, negative, not numbers, or all zero."""
 
 
 def parse_alpha(text: str) -> Alpha:
@@ -40,7 +40,7 @@ def parse_alpha(text: str) -> Alpha:
 
 
 def require_method(name: str) -> str:
-    """`name`, if a method has this name; otherwise raises UserError."""
+    """Return `name` if it is one of `METHODS`. Raises UserError otherwise."""
     if name not in METHODS:
         raise UserError(f"there is no balance {name!r}; choose one of {', '.join(METHODS)}")
     return name
