@@ -1,1 +1,2 @@
-"""Runs a finished model on images, without torch: the only part of mtlnet that `serve` imports."""
+"""Runs a finished model on images, by default without torch. `serve` imports no other part of
+mtlnet."""
