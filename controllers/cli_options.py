@@ -1,9 +1,9 @@
 """The options of the `controllers` commands, as annotated fields of their configurations.
 
 A command's configuration is a dataclass. A field with an annotation is an option of the command, so
-an option is declared once: the annotation is its help text or a `typer.Option`. Options of several
-commands are defined here. Rich reads help texts as markup and drops text in square brackets, so a
-default that Typer does not know is a sentence ("Default: ...").
+an option is declared once: the annotation is its help text or a `typer.Option`. Options that
+several commands share are defined here. Rich reads help texts as markup and drops text in square
+brackets, so a default that Typer cannot show is written as a sentence ("Default: ...").
 """
 
 from collections.abc import Callable

@@ -15,19 +15,20 @@ class Observation:
     """One control step: the perceived road and the car's own sensors."""
 
     to_lane_centre: float
-    """m from the centre of the lane to follow; the paper's e1."""
+    """Offset (m, left positive) from the centre of the lane to follow; the paper's e1."""
     angle: float
-    """rad, track tangent minus yaw: positive when the car points to the right (minus e2)."""
+    """Track tangent minus yaw, rad: positive when the car points to the right; the paper's -e2."""
     heading: RoadClass
     """Class of the road: left, straight or right."""
     vx: float
-    """m/s, forward in the body frame."""
+    """Forward speed in the body frame, m/s."""
     vy: float
-    """m/s, to the left in the body frame."""
+    """Speed to the left in the body frame, m/s."""
     yaw_rate: float
-    """rad/s, counter-clockwise."""
+    """Yaw rate, rad/s, counter-clockwise."""
     curvature: float | None = None
-    """1/m, left positive, of the road just ahead; None if it is not measured (on perception)."""
+    """Curvature (1/m, left positive) of the road just ahead; None on perception, which does not
+    measure it."""
 
 
 _values = attrgetter(*(field.name for field in fields(Observation)))
@@ -37,7 +38,7 @@ OBSERVED = len(fields(Observation))
 
 
 class _Column:
-    """A column of `Observations.rows`."""
+    """A descriptor that returns the column `index` of `Observations.rows`, an array (N,)."""
 
     def __init__(self, index: int) -> None:
         self.index = index
@@ -65,7 +66,7 @@ class Observations:
         return len(self.rows)
 
     def split(self) -> list[Observation]:
-        """The observation of each car."""
+        """Return the N observations, one for each car."""
         found = []
         for row in self.rows.tolist():
             row[HEADING] = RoadClass(row[HEADING])
@@ -75,7 +76,7 @@ class Observations:
 
     @staticmethod
     def of(observation: Observation) -> "Observations":
-        """The observations of one car."""
+        """Return the observations of one car: N = 1."""
         return Observations(np.array([_values(observation)], np.float64))  # NaN for None
 
 
@@ -105,7 +106,7 @@ class BatchController(Controller, Protocol):
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """The control loop of a controller."""
+    """The properties of a control loop that a controller is made for."""
 
     dt: float
     """Duration of a control step, s."""

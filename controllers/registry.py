@@ -1,4 +1,4 @@
-"""The controllers by name. To add one, write a class with `update` in `laws` and an entry here.
+"""Makes controllers by name. To add one, write a class with `update` in `laws` and an entry here.
 
 A user's own controller needs no entry. `MODULE:CLASS` is a class of a module that Python can
 import, also from the working folder; `FILE.py:CLASS` is a class of a file.
@@ -24,7 +24,8 @@ from controllers.laws.actor import is_actor
 from trackfeatures.errors import UserError
 
 OWN_FILE = "controller_of_"
-"""Prefix of a user's file in `sys.modules`, so that the file hides no other module."""
+"""Prefix of the module name of a user's file, so that the file replaces no other module in
+`sys.modules`."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class ControllerEntry:
     about: str
     """A description of one line."""
     tunable: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Ranges of the parameters that `controllers tune` searches; all limits are above 0."""
+    """Lowest and highest value of each parameter in the search of `controllers tune`, both above
+    0."""
 
 
 _LQR_WEIGHTS = {
@@ -93,7 +95,7 @@ CONTROLLERS: dict[str, ControllerEntry] = {
 def make_controller(
     name: str, loop: LoopConfig, parameters: Mapping[str, float] | None = None
 ) -> Controller:
-    """The controller called `name`, with `parameters`.
+    """Make the controller called `name`, with `parameters`.
 
     `name` is a key of `CONTROLLERS`, the folder of a trained actor, or a user's class. Raises
     UserError for an unknown name or parameter, a module that cannot be imported, and a class that
@@ -130,7 +132,7 @@ def make_controller(
 
 
 def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
-    """The controller of a user's class."""
+    """Make a controller of the user's class `name`, MODULE:CLASS or FILE.py:CLASS."""
     place, _, class_name = name.rpartition(":")
     module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     found = getattr(module, class_name, None)

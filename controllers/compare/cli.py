@@ -14,7 +14,7 @@ TERMINAL_WIDTH = 120  # columns that the tables need
 
 @options(CompareConfig)
 def compare(config: CompareConfig, as_json: bool) -> None:
-    """Drive every controller on every track and print the paper's table.
+    """Drive every controller on every track and print a table of the scores, as in the paper.
 
     The cars drive on one lane, from a standing start, with throttle 0.2 in gear 1. The same command
     continues an interrupted comparison: it skips the drives whose results are in the folder.
@@ -36,8 +36,8 @@ def compare(config: CompareConfig, as_json: bool) -> None:
 def tune(config: TuneConfig, as_json: bool) -> None:
     """Search the parameters of controllers, with the same number of drives for each controller.
 
-    `controllers drive` and `controllers compare` read the file with --parameters. The same command
-    continues an interrupted search.
+    `controllers drive` and `controllers compare` read the written file with --parameters. The same
+    command continues an interrupted search.
     """
     from controllers.compare.tune import tune as run
 

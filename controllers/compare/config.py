@@ -21,8 +21,8 @@ class CompareConfig:
     ] = "truth"
     seeds: Annotated[
         int,
-        "Number of drives of each kind, with seeds 0, 1, ... The drives of a kind are equal on the "
-        "truth without --disturb.",
+        "Number of times that each drive is repeated, with the seeds 0, 1, ... On the truth the "
+        "seed has no effect without --disturb.",
     ] = 1
     disturb: Annotated[
         bool,

@@ -11,7 +11,10 @@ COLUMNS = ("t", "d", "angle", "perceived_d", "perceived_angle")
 
 
 class CurveRecorder:
-    """An observer of a drive on one lane, whose centre is the centre of the track."""
+    """An observer that records the curves of a drive on a track with one lane.
+
+    The offset from the track's centre is then also the offset from the lane's centre.
+    """
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
@@ -21,15 +24,16 @@ class CurveRecorder:
         self._rows.append((now.time_s, now.to_middle, now.angle, seen, perceived.angle))
 
     def curves(self) -> dict[str, list[float | None]]:
-        """The curves of the steps so far, by `curves_of`."""
+        """Return the curves of the steps so far, in the format of `curves_of`."""
         return curves_of(np.array(self._rows))
 
 
 def curves_of(table: FloatArray) -> dict[str, list[float | None]]:
-    """The columns `COLUMNS` of the control steps `table` (n, 5), at up to `MAX_POINTS` points.
+    """Return the columns of `table`, called `COLUMNS`, thinned to at most `MAX_POINTS` points.
 
-    A value is None where nothing was perceived. The steps are divided into parts of equal length,
-    and each point is the step with the largest offset in its part, so that no peak is lost.
+    `table` (n, 5) has a row for each control step: s, m, rad, m, rad. NaN (nothing was perceived)
+    becomes None. The steps are divided into parts of equal length, and each point is the step with
+    the largest offset in its part, so that no peak is lost.
     """
     chosen = [
         part[np.argmax(np.abs(table[part, 1]))]

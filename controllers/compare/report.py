@@ -34,9 +34,10 @@ def spread(values: list[float], digits: int) -> str:
 
 
 def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Titles and rows of the paper's table: scores per step by track and controller.
+    """Return the titles and rows of a table of scores per step: a row for each track, a column for
+    each controller.
 
-    Tracks that were driven over the paper's number of steps also show the paper's scores.
+    A track that was driven over the paper's number of steps also shows the paper's scores.
     """
     controllers = list(dict.fromkeys(entry["controller"] for entry in drives))
     tracks = list(dict.fromkeys(entry["track"] for entry in drives))
@@ -60,7 +61,7 @@ def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
 
 
 def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
-    """Rows with the columns `FIGURES`, one for each track and controller, over all seeds."""
+    """Yield a row with the columns `FIGURES` for each track and controller, over all seeds."""
     pairs = dict.fromkeys((entry["track"], entry["controller"]) for entry in drives)
     for track, controller in pairs:
         results = _results(drives, track, controller)
@@ -115,7 +116,8 @@ def write_report(out: Path, content: dict[str, Any]) -> Path:
 
 
 def driving_curves(curves: dict[str, list[float | None]]) -> tuple[Markup, Markup]:
-    """Charts of true and perceived offset and angle, as in the paper's figures 12 and 13."""
+    """Return a chart of the offset (m) and one of the angle (rad) over time (s), true and
+    perceived, as in the paper's figures 12 and 13."""
     columns = {
         name: np.array([np.nan if value is None else value for value in values])
         for name, values in curves.items()

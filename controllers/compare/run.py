@@ -42,14 +42,14 @@ Progress = Callable[[float, int, str], None]
 the total number of drives, and the name of the present drive or controller. Several threads call
 it."""
 Report = Callable[[float, str], None]
-"""`Progress` without the total number."""
+"""A function that is called with the first and the last argument of `Progress`."""
 Driven = dict[str, Any] | UserError
 """The result of a drive with its curves, or the error of a drive without a result."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One drive of a comparison."""
+    """The settings that identify one drive of a comparison."""
 
     track: str
     controller: str
@@ -64,7 +64,7 @@ class Cell:
 
 
 def cells(config: CompareConfig) -> list[Cell]:
-    """All drives, ordered by track. Raises UserError for an empty list or fewer than one seed."""
+    """Return all drives, ordered by track. Raises UserError for an empty list or no seed."""
     if config.seeds < 1:
         raise UserError(f"{config.seeds} seeds; give 1 or more")
     disturbances = list(DISTURBANCES) if config.disturb else [UNDISTURBED]
@@ -79,7 +79,7 @@ def cells(config: CompareConfig) -> list[Cell]:
 
 
 def names(text: str, what: str) -> list[str]:
-    """The names in `text`, separated by commas, without repetition.
+    """Return the names in `text`, separated by commas, without repetition.
 
     Raises UserError for an empty list; `what` is the name of the option.
     """
@@ -170,7 +170,7 @@ def drive_cells(
 
 
 def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
-    """The configuration and the disturbance of each cell's drive."""
+    """Return the configuration and the disturbance of each cell's drive."""
     widths = {
         name: find_track(name, config.tracks_dir).width
         for name in dict.fromkeys(cell.track for cell in todo)
@@ -204,7 +204,7 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
 
 
 def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
-    """For each controller with `update_batch`, the cells that `drive_many` can drive at once."""
+    """Return, for each controller with `update_batch`, the cells that `drive_many` can drive."""
     groups: dict[str, list[Cell]] = {}
     for cell, (drive_config, _) in tasks.items():
         if can_join(drive_config):
@@ -221,7 +221,7 @@ def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, 
 
 
 def entry_of(cell: Cell, outcome: Outcome) -> Driven:
-    """The result of a drive of `drive_many`; it includes the curves if the seed is 0."""
+    """Convert an outcome of `drive_many`: the result, with the curves if the seed is 0."""
     if isinstance(outcome.result, UserError):
         return outcome.result
     curves = {"curves": curves_of(outcome.curves)} if cell.seed == 0 else {}
@@ -241,7 +241,7 @@ def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> 
 
 
 def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
-    """The tuned parameters of a controller; {} if the file has no entry for it."""
+    """Read a controller's tuned parameters; {} without a file or without an entry in it."""
     if config.parameters is None:
         return {}
     try:
@@ -252,8 +252,8 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
 
 
 def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
-    """For each drive, a hash of the inputs that its cell does not name: the tuned parameters, the
-    road, the user's file or trained actor, and the weights of the model or the service's model."""
+    """Return, for each drive, a hash of the inputs that its cell does not contain: the tuned
+    parameters, the road, the user's file or trained actor, and the weights of the model."""
     tracks = {
         name: find_track(name, config.tracks_dir).content_hash.encode()
         for name in dict.fromkeys(cell.track for cell in todo)
@@ -282,7 +282,7 @@ def _model_of(config: CompareConfig, perception: str) -> str:
 
 
 def _file_of(controller: str) -> Path | None:
-    """The weights of a trained actor, or the file of a user's class, whose module is imported."""
+    """Path of a trained actor's weights or of the file with a user's class, else None."""
     if is_actor(Path(controller)):
         return Path(controller) / WEIGHTS
     place = controller.rpartition(":")[0]
@@ -298,14 +298,14 @@ def model_hash(run: str) -> str:
 
 
 def service_model_hash(url: str) -> str:
-    """SHA-256 of the weights of the service at `url`. Raises UserError without an answer."""
+    """SHA-256 of the weights of the service at `url`. Raises UserError if it does not answer."""
     service = ServiceModel(url)
     service.close()
     return service.model_hash
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
-    """The results so far. Raises UserError for a file of other settings or another version."""
+    """Read the results so far. Raises UserError for a file of other settings or version."""
     settings = {name: getattr(config, name) for name in SETTINGS}
     if not path.exists():
         return {"version": VERSION, "settings": settings, "drives": []}
@@ -340,7 +340,7 @@ def _report_share(report: Report, done: int, name: str, step: int, steps: int) -
 
 
 def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
-    """The drives by (perception, disturbance), in their order in `content`."""
+    """Yield the drives grouped by (perception, disturbance), in their order in `content`."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for entry in content["drives"]:
         found.setdefault((entry["perception"], entry["disturbance"]), []).append(entry)

@@ -1,8 +1,9 @@
 """A search for the parameters of several controllers, with equal budgets of drives.
 
-The first candidate is the controller's own parameters. A third of the budget is drawn log-uniformly
-over the whole ranges, the rest around the best candidate so far with a falling spread. The file is
-written after each candidate, so the same command continues an interrupted search.
+The first candidate is the controller's own parameters. The candidates of the first third of the
+budget are log-uniformly random over the whole ranges. All later candidates are random around the
+best candidate so far, with a falling spread. The file is written after each candidate, so the same
+command continues an interrupted search.
 """
 
 import json
@@ -27,7 +28,7 @@ from trackfeatures.errors import UserError
 
 VERSION = 1
 EXPLORED = 1.0 / 3.0
-"""Share of the budget that is drawn over the whole ranges."""
+"""Share of the candidates that are random over the whole ranges."""
 SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed", "budget")
 """Settings that are stored in the file. A search with other settings refuses the file."""
 
@@ -82,7 +83,7 @@ def propose(
     budget: int,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """The next candidate after the candidates in `tried`; {} stands for the controller's own
+    """Return the next candidate after the candidates in `tried`; {} stands for the controller's own
     parameters."""
     if not tried:
         return {}

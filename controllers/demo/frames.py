@@ -32,7 +32,8 @@ class PostedFrame:
 
 
 def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
-    """`count` frame numbers in ascending order, drawn equally from all rounds, none twice."""
+    """Return `count` different frame numbers, random, equally many of each round, in ascending
+    order."""
     rounds = frames.labels.round
     shares = np.array_split(np.arange(count), len(np.unique(rounds)))
     chosen: list[int] = []

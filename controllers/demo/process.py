@@ -15,7 +15,7 @@ from serve.client import Client
 from trackfeatures import UserError
 
 START_LIMIT_S, STOP_LIMIT_S = 60.0, 10.0
-"""Time in which the service must be ready, and in which a child process must end."""
+"""Time (s) in which the service must be ready, and time in which a child process must end."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -47,7 +47,7 @@ def run_module(command: list[str]) -> tuple[int, str]:
 
 
 def free_port() -> int:
-    """A port of the loopback interface that is free at present."""
+    """Return a port of the loopback interface that is free at present."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -24,7 +24,8 @@ from trackfeatures import MARKINGS
 from trackfeatures.camera import CameraParameters
 
 LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
-"""Largest mean errors in m and rad, and the least accuracy of the class of the road."""
+"""Largest allowed mean errors of `ml` and `mr` (m) and of the angle (rad), and least allowed share
+of right classes of the road."""
 MAX_MEAN_ABS_D_M = 0.3
 """Largest mean offset (m) of the drive on the service's answers; the car must stay on the road."""
 LIMIT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
@@ -64,7 +65,7 @@ class LimitCheck:
 
 
 def check_limits(result: DemoResult) -> list[LimitCheck]:
-    """The checks of all results of the demo: evaluation, posted frames, drive."""
+    """Return the checks of all results of the demo: evaluation, posted frames, drive."""
     return [
         *check_evaluation(result.evaluation),
         *check_posted(result.asked, result.evaluation),
@@ -125,7 +126,7 @@ def check_drive(drive: dict[str, Any]) -> LimitCheck:
 
 
 def check_cells(check: LimitCheck) -> tuple[str, ...]:
-    """The cells of `LIMIT_COLUMNS` for a check."""
+    """Return the cells of a check's row; the columns are `LIMIT_COLUMNS`."""
     limit = "" if check.limit is None else f"{check.limit:.4g}"
     mean = "" if check.mean is None else f"{check.mean:.4f}"
     ratio = "" if check.mean is None else f"{check.figure / check.mean:.2f}"
@@ -158,7 +159,7 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
 
 
 def _answer_cells(frame: PostedFrame) -> tuple[str, ...]:
-    """The cells of `ANSWER_COLUMNS` for a frame: "true / predicted" values."""
+    """Return a frame's row, "true / predicted" values; the columns are `ANSWER_COLUMNS`."""
     answer = frame.answer
     distances = ((frame.distances[name], answer["distances_m"][name]) for name in MARKINGS)
     return (
@@ -177,7 +178,7 @@ def _pair(true: float | None, predicted: float | None, digits: int) -> str:
 
 
 def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[dict[str, str]]:
-    """The frames with their captions; true and predicted markings are drawn on them."""
+    """Yield each frame, with true and predicted markings drawn on it, and its caption."""
     for one in frames:
         image = simplejpeg.decode_jpeg(one.jpeg)
         prediction = (one.answer["distances_m"], one.answer["angle_rad"])
@@ -188,7 +189,8 @@ def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[di
 
 
 def _training_curves(path: Path) -> Markup | None:
-    """A chart of the training losses, as shares of their first values; None without a point."""
+    """A chart of the losses over the training steps, as shares of their first values; None if the
+    file `path` has no row."""
     rows = read_curves(path)
     if not rows:
         return None

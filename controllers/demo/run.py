@@ -35,7 +35,7 @@ COLLECTED_PER_S, CHECKED_PER_S = 250, 2_000
 
 @dataclass(slots=True)
 class DemoResult:
-    """The results of all steps, for the report."""
+    """The results of all steps of the demo, for its report."""
 
     collected: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class DemoResult:
     commands: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     shipped: list[PostedFrame] = field(default_factory=list)
-    """Frames answered by the shipped model."""
+    """Frames with the answers of the shipped model."""
 
     def as_json(self) -> dict[str, Any]:
         """The fields as values for JSON, without the images."""
