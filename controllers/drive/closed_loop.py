@@ -154,9 +154,9 @@ def run_lap(
 ) -> DriveResult:
     """Drive `steps` control steps from the world's present state, or until the episode ends.
 
-    `lane_centre` (m, left positive) is the line from which `mean_abs_d_m` is measured. `noisy`
-    marks the result of a perception with errors. `record` is called with the state and the steering
-    action of each step. The reward of a step is the reward of the state after it.
+    `lane_centre` (m, left positive) is the line from which `mean_abs_d_m` is measured. `noisy` is
+    copied to the result: whether the perception has errors. `record` is called with the state and
+    the steering action of each step. The reward of a step is the reward of the state after it.
     """
     memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
     start_m, slowed_steps, ended = world.state.odometer_m, 0, None
@@ -193,8 +193,8 @@ def check_reward(name: str) -> None:
 
 
 def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tuple[float, float]:
-    """Throttle and brake, each 0 to 1. On a free road the car keeps `throttle`; behind a slower car
-    the throttle is reduced or the car brakes."""
+    """Return throttle and brake, each 0 to 1. On a free road the throttle is `throttle`; behind a
+    slower car it is reduced, or the car brakes."""
     leader = traffic.leader(now.s, now.to_middle) if traffic.count else None
     if leader is None:
         return throttle, 0.0
@@ -205,7 +205,8 @@ def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tupl
 
 
 def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float]:
-    """Throttle and brake that slow the car down to `LOST_SPEED`; below it they are unchanged."""
+    """Return throttle and brake that slow the car down to `LOST_SPEED`; if `speed` (m/s) is lower,
+    return them unchanged."""
     if speed > LOST_SPEED:
         return 0.0, max(brake, LOST_BRAKE)
     return throttle, brake
@@ -222,7 +223,7 @@ class OffsetMemory:
         self._last = 0.0
 
     def fill(self, offset: float | None) -> float:
-        """`offset`; if it is None, the last offset for `hold_steps` steps and then 0."""
+        """Return `offset` (m); if it is None, the last offset for `hold_steps` steps and then 0."""
         if offset is not None:
             self.age, self._last = 0, offset
             return offset
@@ -290,8 +291,9 @@ class Driven:
 def sum_rewards(
     after: FloatArray, lane_centre: float, half_width: float, ended: bool
 ) -> tuple[float, float]:
-    """The sums of `step_reward` and `quadratic_reward` over the steps `after` (n, 5) of `Driven`.
+    """Return the sums of `step_reward` and `quadratic_reward` over the n steps of a drive.
 
+    `after` (n, 5) is the field of `Driven`; `lane_centre` and `half_width` (of the track) are in m.
     `ended`: whether the last step ended the drive.
     """
     score, quadratic = 0.0, 0.0
@@ -309,7 +311,7 @@ x, y and z in m."""
 
 
 class DriveLog:
-    """CSV log with the columns of the reference laps of the real TORCS, a row per control step.
+    """CSV log with a row for each control step and the columns of the laps recorded in TORCS.
 
     A row has the state before the control step and the steering action. The row is complete when
     `write` returns.

@@ -9,7 +9,7 @@ from typer import Option
 from controllers import cli_options as options
 
 THROTTLE = 0.2
-"""The held throttle, in gear 1."""
+"""The paper's constant throttle (0 to 1), in gear 1."""
 
 
 @dataclass(frozen=True)

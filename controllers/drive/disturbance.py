@@ -1,4 +1,4 @@
-"""Disturbances of a drive: sensor noise, delay, wind, and another car. SI units.
+"""Disturbances of a drive: sensor noise, delay, wind, and changed parameters of the car. SI units.
 
 A disturbance depends only on the seed of the drive, so that all controllers drive under the same
 disturbance (paired seeds).
@@ -20,18 +20,18 @@ from trackfeatures.errors import UserError
 
 OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.05, 0.005
 SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S = 0.1, 0.01
-"""Standard deviations of the noise on an observation, drawn for each step."""
+"""Standard deviations of the noise on an observation; each step has new random noise."""
 NOISE_STD = np.array(
     (OFFSET_NOISE_M, ANGLE_NOISE_RAD, SPEED_NOISE_M_S, SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S)
 )
-"""Standard deviations of the noise on offset, angle, vx, vy and yaw rate."""
+"""The same standard deviations as an array, for offset, angle, vx, vy and yaw rate."""
 DELAY_S = 0.1
 """Delay (s) of the perception."""
 GUST_M_S, GUST_S = 6.0, 1.5
-"""Standard deviation and correlation time of the side wind (a Gauss-Markov process)."""
+"""Standard deviation (m/s) and correlation time (s) of the side wind, a Gauss-Markov process."""
 SIDE_FORCE_M2 = 4.5
-"""Side force divided by air density, wind speed and speed: the slope of the side force coefficient,
-2.3 / rad, times the frontal area."""
+"""Slope of the side force coefficient (2.3 / rad) times the frontal area (m2). Half of it times air
+density, wind speed and driving speed is the side force."""
 AIR_DENSITY = CarParameters.air_density
 FRICTION = (0.8, 1.6)
 """Range of the tyres' friction coefficient."""
@@ -52,7 +52,7 @@ class Disturbance:
     stiffness: bool = False
 
     def car(self, seed: int) -> CarParameters:
-        """The car of the drive with the seed `seed`."""
+        """Return the car's parameters; the disturbed ones are random and depend on `seed` only."""
         rng, car = np.random.default_rng([seed, 5]), CarParameters()
         low, high = FRICTION
         friction = rng.uniform(low, high)
@@ -70,7 +70,7 @@ class Disturbance:
         return car
 
     def world(self, road: Road, *, traffic: int, frequency_hz: int, seed: int) -> World:
-        """The world of the drive with the seed `seed`."""
+        """Return a world with the car of `seed`, and with side wind if `wind` is set."""
         car = self.car(seed)
         if self.wind:
             gusts = self.gusts(1.0 / frequency_hz, seed)
@@ -78,17 +78,18 @@ class Disturbance:
         return World(road, traffic=traffic, frequency_hz=frequency_hz, car=car)
 
     def controller(self, controller: Controller, seed: int) -> Controller:
-        """`controller` with the sensors of the drive with the seed `seed`."""
+        """Return `controller`; if `noise` is set, its observations get the noise of `seed`."""
         if not self.noise:
             return controller
         return NoisySensors(controller, self.noise_rng(seed))
 
     def gusts(self, dt: float, seed: int) -> "Gusts":
-        """The wind of the drive with the seed `seed` and control steps of `dt` s."""
+        """Return the side wind of the seed `seed` for control steps of `dt` s."""
         return Gusts(dt, np.random.default_rng([seed, 4]))
 
     def noise_rng(self, seed: int) -> np.random.Generator:
-        """Generator of the standard normal numbers (5,) of each step, which NOISE_STD scales."""
+        """Return the generator of the noise. The noise of a step is NOISE_STD times five standard
+        normal numbers."""
         return np.random.default_rng([seed, 6])
 
 
@@ -105,7 +106,7 @@ DISTURBANCES: dict[str, Disturbance] = {
 
 
 def find_disturbance(name: str) -> Disturbance:
-    """The disturbance called `name`. Raises UserError for an unknown name."""
+    """Return the disturbance called `name`. Raises UserError for an unknown name."""
     if name not in DISTURBANCES:
         known = ", ".join(DISTURBANCES)
         raise UserError(f"there is no disturbance {name!r}; use one of: {known}")
@@ -133,7 +134,8 @@ class NoisySensors:
 
 
 class Gusts:
-    """Side wind (m/s, positive from the right), one value for each control step of `dt` s."""
+    """Side wind (m/s, positive from the right); `step` returns the value of the next control step
+    of `dt` s."""
 
     def __init__(self, dt: float, rng: np.random.Generator) -> None:
         self._keep = math.exp(-dt / GUST_S)
@@ -165,8 +167,9 @@ class WindyWorld(World):
 def push(
     motion: FloatArray, yaw: float, vx: float, wind: float, mass: float, frequency_hz: int
 ) -> None:
-    """Add the change of speed by a side wind (m/s) over a control step to the `motion` of a car of
-    `mass` kg that drives at `vx` m/s."""
+    """Add the effect of a side `wind` (m/s) over one control step to the velocity in `motion`
+    (MOTION,), world frame. The car has the mass `mass` kg, the yaw `yaw` rad, the speed `vx` m/s.
+    """
     change = AIR_DENSITY * SIDE_FORCE_M2 * wind * abs(vx) * 0.5 / mass / frequency_hz
     motion[7] -= change * math.sin(yaw)
     motion[8] += change * math.cos(yaw)

@@ -27,16 +27,16 @@ CURVE_HEIGHT = 90  # px
 OFFSET_SPAN_M, ANGLE_SPAN_RAD = 1.0, 0.1
 """Values at the upper and lower edge of the curves; larger values are drawn at the edge."""
 NOTHING: tuple[Distances, float] = ({}, 0.0)
-"""The perceived markings and angle on the truth: there are no markings, and the film shows only the
-true markings."""
+"""The perceived markings and angle of a drive without a model: no markings, so that the film shows
+only the true ones."""
 TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 
 
 class DriveFilm:
-    """Draws a picture for each control step into `film`.
+    """Draws a picture for each control step and writes it to `film`.
 
-    With a camera perception the film shows its images and its answers. On the truth `camera`
-    renders the images.
+    With a camera perception the film shows its images and its answers. Without one (`perception` is
+    None) `camera` renders the images.
     """
 
     def __init__(
@@ -91,16 +91,16 @@ class DriveFilm:
 
 
 def caption(text: str, width: int) -> Image:
-    """A line of text on a dark strip, (28, width, 3)."""
+    """Draw a line of text on a dark strip, an image (28, width, 3)."""
     strip = np.full((28, width, 3), BACK, np.uint8)
     cv2.putText(strip, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, TEXT_COLOUR, 1, cv2.LINE_AA)
     return strip
 
 
 def curves(values: NDArray[np.float64], length: int, width: int, span: float, title: str) -> Image:
-    """A strip (CURVE_HEIGHT, width, 3) with the curves of true and perceived values (n, 2).
+    """Draw the curves of the true and perceived `values` (n, 2): an image (CURVE_HEIGHT, width, 3).
 
-    The strip has room for `length` values and the last value is at its right edge. `span` is the
+    The image has room for `length` values and the last value is at its right edge. `span` is the
     value at the upper edge; up is positive (left). NaN leaves a gap.
     """
     strip = np.full((CURVE_HEIGHT, width, 3), BACK, np.uint8)

@@ -1,4 +1,4 @@
-"""Many drives of one controller at once: the cars of a fleet, moved and observed by compiled calls.
+"""Drives many cars with one controller at the same time. Compiled calls move and observe the cars.
 
 The result of a drive equals the result of `controllers.drive.run.drive` bit for bit, for any number
 of drives. All drives are on the truth, with the throttle held; each core moves a part of the cars.
@@ -48,7 +48,8 @@ FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
     *("target_lane", "seed", "model", "light"),
 )
-"""Options that the drives may have; the model and the light have no effect on the truth."""
+"""Options that can differ from their defaults; the model and the light have no effect on the truth.
+"""
 STEPS_BETWEEN_REPORTS = 50
 LOOP = LoopConfig(1.0 / FREQUENCY_HZ)
 PHYSICS_STEPS = PHYSICS_HZ // FREQUENCY_HZ
@@ -61,15 +62,15 @@ Several threads call it."""
 
 @dataclass(frozen=True)
 class Outcome:
-    """One of many drives."""
+    """The result of one drive of `drive_many`."""
 
     number: int
     """Index of the drive in the list of drives."""
     result: DriveResult | UserError
     """The result, or the error of a drive without a result; an error does not stop other drives."""
     curves: FloatArray
-    """(n, 5): time (s), true offset (m) and angle (rad), perceived offset (NaN: none) and angle, in
-    each control step, as the controller acted on them."""
+    """(n, 5), a row for each control step: time (s), true offset (m) and angle (rad), and the
+    perceived offset and angle on which the controller acted. NaN: nothing was perceived."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def drive_many(
 
 
 def _check(tasks: Sequence[Task]) -> list[_Ride]:
-    """The drives; a road is made once for all that share it."""
+    """Check the tasks and return their rides; rides on the same road share one `Road`."""
     roads: dict[Any, Road] = {}
     rides = []
     for number, (config, disturbance) in enumerate(tasks):
@@ -154,7 +155,7 @@ def _check(tasks: Sequence[Task]) -> list[_Ride]:
 
 
 class _Batch:
-    """The cars of some rides, which one controller steers."""
+    """The cars of several rides, steered by one controller object."""
 
     def __init__(self, rides: list[_Ride], controller: BatchController) -> None:
         self._rides, self._controller = rides, controller
@@ -194,8 +195,8 @@ class _Batch:
         return [self._outcome(number) for number in range(len(self._rides))]
 
     def _check_steers(self, steers: FloatArray, step: int) -> FloatArray:
-        """The checked steering actions. A drive whose action is not in [-1, 1] ends without a
-        result."""
+        """Return `steers` (N,). A drive whose action is not in [-1, 1] ends here, with an error
+        instead of a result."""
         rows = self._fleet.cars
         wrong = ~(np.abs(steers) <= 1.0) & (rows[:, SKIPPED] == 0.0)
         for number in np.flatnonzero(wrong).tolist():

@@ -1,4 +1,4 @@
-"""The control step of many drives on the truth, compiled, over the rows of a fleet.
+"""The compiled control step of many drives on the truth; each car is a row of a fleet.
 
 Between `command_rides` and `observe_rides` the cars move (`simulator.world.control_step`). SI
 units, track frame.
@@ -58,7 +58,8 @@ class RideArrays(NamedTuple):
     log: FloatArray
     """(N, S + 1, LOG): a row for each control step; see LOG."""
     ended: NDArray[np.int64]
-    """(N,): `ending_code` of the last step."""
+    """(N,): code of the end of each drive (`simulator.env.reward.ending_code`); 0 before its end.
+    """
     steps: NDArray[np.int64]
     """(N,): control steps requested."""
     delays: NDArray[np.int64]
@@ -77,7 +78,8 @@ class RideArrays(NamedTuple):
 
 @compiled_for_threads
 def command_rides(fleet: Arrays, rides: RideArrays, steers: FloatArray, frequency_hz: int) -> None:
-    """Begin a control step of all cars under the steering actions (N,), clipped to [-1, 1]."""
+    """Begin a control step: set the steering actions `steers` (N,) of all cars, clipped to [-1, 1],
+    and add the effect of the wind to their speeds."""
     cars = fleet[0]
     for number in range(len(cars)):
         car = cars[number]
@@ -98,8 +100,8 @@ def command_rides(fleet: Arrays, rides: RideArrays, steers: FloatArray, frequenc
 def observe_rides(
     begin: int, end: int, fleet: Arrays, rides: RideArrays, steps: int
 ) -> tuple[int, int]:
-    """Observe the cars among `begin` to `end` - 1 whose control step of `steps` physics steps is
-    complete; a car whose drive is over is left out of later steps (SKIPPED).
+    """Observe those of the cars `begin` to `end` - 1 that have completed the `steps` physics steps
+    of their control step. Later calls skip a car whose drive is over (SKIPPED).
 
     Returns the number of drives that go on, and the number of cars that did not complete the step.
     """
@@ -141,9 +143,10 @@ def note_state(number: int, fleet: Arrays, rides: RideArrays) -> bool:
 
 @compiled
 def observe_ride(number: int, step: int, car: FloatArray, rides: RideArrays) -> None:
-    """Fill the observation of a car: `controllers.perception.sources.truth` with delay and noise.
+    """Fill the observation of car `number` at the control step `step`: the true road with the delay
+    of the perception, the car's present motion, and noise.
 
-    Before the first answer the offset and the angle are 0, and the road is straight.
+    Until the delay is over, the offset and the angle are 0, and the road is straight.
     """
     seen, track = rides.seen[number], car[TRACK_AT:]
     at = step - rides.delays[number]

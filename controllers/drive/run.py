@@ -1,4 +1,4 @@
-"""One drive from its configuration: road, world, perception, controller, observers.
+"""Makes one drive from its configuration: road, world, perception, controller, observers.
 
 controllers drive --controller lqr --track oval --perception truth --log drive.csv
 """
@@ -41,8 +41,8 @@ FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
 """The paper's number of steps for each of its tracks."""
 GRID_SHARE = 1.0 / 6.0
-"""TORCS's first position on the starting grid: distance to the right of the centre over the track's
-width."""
+"""Distance of TORCS's first grid position to the right of the track's centre, as a share of the
+track's width."""
 TYPICAL_SPEED = 15.0  # m/s, slightly below the speed of gear 1 and THROTTLE on a flat road
 
 START_M, START_S = 5.0, 10.0
@@ -137,7 +137,7 @@ def _check_film(path: Path) -> None:
 def _real_time(
     config: DriveConfig, perceive: Perceive, disturbance: Disturbance
 ) -> RealTimePerception[World, Any, Any]:
-    """`perceive` on the wall clock. Raises UserError if a delay is simulated at the same time."""
+    """Return `perceive` in real time. Raises UserError if a delay is simulated at the same time."""
     if config.latency_ms or disturbance.delay_s:
         raise UserError(
             "--realtime measures the delay of the answers; leave it out, or --latency-ms"
@@ -159,7 +159,7 @@ def check_started(config: DriveConfig, result: DriveResult) -> None:
 
 
 def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
-    """Pedals with the throttle or the speed of `config`.
+    """Return pedals that hold the throttle or the speed of `config`.
 
     Raises UserError if both are given, and for a value out of range.
     """
@@ -179,7 +179,7 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """Adds the latency and the losses of `config` to `perceive`; uncertain answers get less weight.
+    """Add the latency and the losses of `config` to `perceive`; uncertain answers get less weight.
 
     The state is predicted over the latency, but not over the further delay `unknown_s` (s).
     """
@@ -199,7 +199,7 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
 
 
 def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
-    """The parameters of `controller` in a file of `controllers tune`; {} without a file.
+    """Read the parameters of `controller` in a file of `controllers tune`; {} without a file.
 
     Raises UserError for another kind of file, or for a file without parameters of the controller.
     """
@@ -230,7 +230,7 @@ class LastAnswer:
 def _observers(
     config: DriveConfig, stack: ExitStack, world: World, perceive: Perceive, lane: Lane
 ) -> Iterator[Observer]:
-    """The log, the film and the live page; `stack` closes them."""
+    """Yield the observers that `config` names: log, film and live page. `stack` closes them."""
     if config.log is not None:
         log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
         yield lambda now, perceived, steer: log.write(now, steer)
@@ -258,7 +258,7 @@ def _observers(
 def _recorder(
     perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
 ) -> Callable[[CarState, float], None]:
-    """A function that calls the observers and reports the progress."""
+    """Return a function that calls the observers and reports the progress."""
     done = itertools.count()
 
     def record(state: CarState, steer: float) -> None:
@@ -272,7 +272,7 @@ def _recorder(
 
 
 def choose_lane(config: DriveConfig, road: Road) -> Lane:
-    """The lane to follow and the start.
+    """Return the start and the lane to follow.
 
     Raises UserError for a lane or start outside the road. On perception it also raises UserError
     for a target other than the lane of the start, because an image shows only the offset from the
@@ -305,7 +305,8 @@ def choose_lane(config: DriveConfig, road: Road) -> Lane:
 
 
 def steps_for(requested: int | None, track: str, length_m: float) -> int:
-    """Control steps of a drive: `requested`, or the paper's number for the track, or about one lap.
+    """Return the control steps of a drive: `requested`; if it is None, the paper's number for the
+    track, or about one lap.
 
     Raises UserError for a number below 1.
     """

@@ -1,6 +1,7 @@
-"""A trained actor: its network and its files. It needs numpy and safetensors, but no compiler.
+"""A trained actor: its network and its files. The module imports neither torch nor numba.
 
-A folder contains `actor.safetensors` (float32 w1, b1, w2, b2, w3, b3) and the card `actor.json`.
+An actor's folder contains `actor.safetensors` (float32 arrays w1, b1, w2, b2, w3, b3) and the card
+`actor.json`.
 """
 
 import json
@@ -60,7 +61,7 @@ class ActorCard:
 
 
 class Actor:
-    """The network state -> ReLU -> ReLU -> tanh.
+    """A trained network: state, two hidden layers with ReLU, one output with tanh.
 
     `weights` has the arrays called NAMES; the matrices are (inputs, outputs).
     """
@@ -70,7 +71,7 @@ class Actor:
         self.weights = weights
         self.definition = find_state(card.state)
         first = (weights["w1"] / np.array(card.divisor)[:, None]).astype(np.float32)
-        if card.odd:  # the same layer for the mirror image of the state is computed beside it
+        if card.odd:  # one product computes the layer for the state and for its mirror image
             order, signs = mirror_of(self.definition)
             mirrored = np.empty_like(first)
             mirrored[order] = first * signs[:, None]
@@ -107,7 +108,7 @@ def is_actor(folder: Path) -> bool:
 
 
 def load_actor(folder: Path) -> Actor:
-    """The actor in `folder`.
+    """Load the actor in `folder`.
 
     Raises ActorError for missing or damaged files, and for an actor of another state or version,
     which would steer the car off the road.

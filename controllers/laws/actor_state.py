@@ -1,17 +1,18 @@
-"""The state vector that an actor receives; training and driving share its definitions.
+"""The state vector that an actor receives. Training and driving use the same four definitions:
 
-`paper`: the paper's seven numbers (`trackfeatures.state_vector`). `stacked`: d/w (offset over half
-the width of the track), angle/pi, v_x and v_y over 75 km/h, the class of the road as a number (left
-1, straight 0, right -1), the yaw rate (rad/s), the changes of d/w and angle/pi since the last step,
-and the last two steering actions. The curvature of the road can be inferred from these numbers; the
-paper's state does not contain it. LQR also receives the yaw rate. `residual`: `stacked` and the
-steering of the controller `lqr`. 0.3 times the actor's action is added to that steering (Johannink
-et al. 2019, residual reinforcement learning). `history`: the paper's state of the present step, and
-the differences of the states of the seven steps before from it. Noise, delay and the car's motion
-can be inferred from `history`.
+- `paper` has the paper's seven numbers (`trackfeatures.state_vector`).
+- `stacked` has d/w (offset over half the width of the track), angle/pi, v_x and v_y over 75 km/h,
+  the class of the road as a number (left 1, straight 0, right -1), the yaw rate (rad/s), the
+  changes of d/w and angle/pi since the last step, and the last two steering actions. The curvature
+  of the road can be inferred from them, but not from `paper`. LQR also receives the yaw rate.
+- `residual` has the numbers of `stacked` and the steering of the controller `lqr`. The car is
+  steered by that steering plus 0.3 times the actor's action (residual reinforcement learning,
+  Johannink et al. 2019).
+- `history` has the paper's state of the present step, and the differences between the states of
+  the seven steps before and the present state. Noise, delay and the car's motion can be inferred.
 
-Every drive divides the lateral offset by half the width of the track of the training: a controller
-does not know the width of the road, and its gains are per metre.
+Every drive divides the lateral offset by half the width of the track of the training, because a
+controller does not know the width of the road, and its gains are per metre.
 """
 
 from collections import deque
@@ -29,8 +30,8 @@ STEP_S = 0.05
 """The control step of the trainings; an actor drives at the same rate."""
 EXACT = LoopConfig(STEP_S)
 RESIDUAL_REACH = 0.3
-"""Steering, in [-1, 1], that the action 1 adds to the steering of LQR; a bend of 25 m radius needs
-about 0.3."""
+"""Steering action that the actor's action 1 adds to the steering of LQR. A bend of 25 m radius
+needs a steering action of about 0.3."""
 
 
 @dataclass(frozen=True)
@@ -99,22 +100,22 @@ STATES = {state.name: state for state in (PAPER, STACKED, RESIDUAL, HISTORY)}
 
 
 def find_state(name: str) -> StateDefinition:
-    """The definition called `name`. Raises UserError for an unknown name."""
+    """Return the definition called `name`. Raises UserError for an unknown name."""
     if name not in STATES:
         raise UserError(f"there is no state {name!r}; use one of: {', '.join(STATES)}")
     return STATES[name]
 
 
 def paper_state(seen: Observation, half_width: float) -> Vector:
-    """The paper's state (7,) of an observation; `half_width`: half the width (m) of the track of
-    the training."""
+    """Return the paper's state (7,) of an observation. `half_width` is half the width (m) of the
+    track of the training."""
     return state_vector(
         *(seen.to_lane_centre, seen.angle, seen.vx, seen.vy, seen.heading), half_width=half_width
     ).astype(np.float32)
 
 
 def history_state(recent: Vector) -> Vector:
-    """The state `history` (..., 56) from the paper's states (..., 8, 7), the newest first."""
+    """Return the state `history` (..., 56) from the paper's states (..., 8, 7), newest first."""
     now, before = recent[..., :1, :], recent[..., 1:, :]
     whole: Vector = np.concatenate((now, before - now), axis=-2)
     return whole.reshape(*recent.shape[:-2], HISTORY.size)

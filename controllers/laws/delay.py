@@ -1,4 +1,4 @@
-"""The delay of a perception, estimated from the car's own yaw rate, compiled. SI units.
+"""Compiled functions that estimate the delay of a perception from the car's yaw rate. SI units.
 
 The estimate is the number of control steps by which the perceived heading lags behind the measured
 yaw rate. The heading error theta changes by theta' = r - kappa vx, with the yaw rate r and the
@@ -46,11 +46,11 @@ DELAY_MEMORY = np.dtype(
         ("squares", np.float64, (len(SPANS), WINDOW, MAX_DELAY + 1)),
     ]
 )
-"""The memory of the estimate of one car."""
+"""The values that the estimate of one car's delay keeps between two control steps."""
 
 
 def first_delays(cars: int, dt: float, known_s: float | None = None) -> NDArray[Any]:
-    """The memory (N,) of `cars` cars at the start.
+    """Return the initial memory (N,) of N = `cars` cars, of the type DELAY_MEMORY.
 
     `known_s`: the delay in s, which is then not estimated; None if it is unknown. Raises UserError
     for a delay of more than `MAX_DELAY` steps of `dt` s.
@@ -105,7 +105,7 @@ def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
 @compiled
 def decide(memory: Any, compared: Vector, span: int) -> None:
     """Change `memory.steps` to the delay with the smallest mean of the squared residuals `compared`
-    (n, delays), if the difference is at least `SURE` standard errors."""
+    (n, delays), if the means differ by more than `SURE` standard errors. Update `is_known`, too."""
     n, best = len(compared), 0
     sums = np.zeros(MAX_DELAY + 1)
     for row in range(n):

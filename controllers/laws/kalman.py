@@ -1,9 +1,9 @@
-"""The car's state relative to the road, estimated from noisy and late measurements. SI units.
+"""Estimates the car's state relative to the road from noisy and late measurements. SI units.
 
-A Kalman filter of the linear single-track model (Rajamani, "Vehicle Dynamics and Control", 2.2) on
-(e, theta, vy, r, kappa): offset from the line (m, left positive), heading error (rad,
-counter-clockwise), lateral speed (m/s), yaw rate (rad/s) and the curvature of the road (1/m), which
-is a random walk.
+The estimator is a Kalman filter with the linear single-track model (Rajamani, "Vehicle Dynamics and
+Control", 2.2). Its state is (e, theta, vy, r, kappa): offset from the line (m, left positive),
+heading error (rad, counter-clockwise), lateral speed (m/s), yaw rate (rad/s) and the curvature of
+the road (1/m), which is modelled as a random walk.
 
 A perception measures e and theta, possibly late; the car measures vy and r at once. The filter
 estimates the state at the moment of the image, and predicts it to the present with the car's
@@ -36,16 +36,15 @@ CAR = LateralModel(
 """The car with its fuel. Yaw inertia and tyre stiffness are estimated from the recorded TORCS laps
 (`simulator.vehicle.car`); the paper's values differ."""
 PROCESS_STD = np.array([0.003, 0.0007, 0.02, 0.02, 0.0005])
-"""Standard deviations of the model's error in a control step, at `USUAL_M_S` and above."""
+"""Standard deviations of the model's error (e, theta, vy, r, kappa) per step, from USUAL_M_S on."""
 USUAL_M_S, SLOWEST_SHARE = 15.0, 0.1
 """Below USUAL_M_S the standard deviations PROCESS_STD fall in proportion to the speed, to a tenth
 at least: the state of a slow car changes less in a control step."""
 START_STD = np.array([0.1, 0.05, 0.1, 0.1, 0.02])
 LEAST_STD = np.array([1e-3, 2e-4, 1e-2, 1e-3])
 MOST_STD = np.array([0.2, 0.02, 0.12, 0.012])
-"""Lower and upper limits of the measurements' standard deviations (e, theta, vy, r). The upper
-limits give each sensor some weight at all times; the oscillation of a car is not taken for noise.
-"""
+"""Lower and upper limits of the measurements' standard deviations (e, theta, vy, r). Because of the
+upper limits each sensor always has some weight, and an oscillating car is not taken for noise."""
 NOISE_STEPS = 100
 """Control steps over which the variance of the noise is averaged."""
 THIRD_DIFFERENCE = 20.0
@@ -66,7 +65,8 @@ STATE_MEMORY = np.dtype(
         ("last", np.float64, 5),
     ]
 )
-"""The memory of the estimate of one car. At the start all fields except the last speed are zero."""
+"""The values that the filter of one car keeps between two control steps. Initially all are zero,
+except the last speed."""
 SPEED = 2
 """Index of vx in the field `last`."""
 
@@ -90,11 +90,11 @@ class StateEstimate:
         return speeds
 
     def update(self, observations: Observations, wheel_angles: Vector) -> Vector:
-        """The present states (N, 5) from the observations of this control step.
+        """Return the present states (N, 5) after the observations of this control step.
 
         `wheel_angles` (N,): angles (rad) of the front wheels since the last control step. A
-        measurement that is not finite counts as unchanged, because otherwise it would stay in the
-        filter.
+        measurement that is not finite is replaced by the last finite one, because otherwise it
+        would stay in the filter.
         """
         if len(self.memory) != len(observations):
             self.delays = first_delays(len(observations), self._dt, self._delay_s)
@@ -108,7 +108,8 @@ class StateEstimate:
 def estimate_states(
     seen: Vector, wheel_angles: Vector, memory: Any, delays: Any, table: Vector, dt: float
 ) -> Vector:
-    """`StateEstimate.update` for the rows of `Observations`; `memory` and `delays` are replaced."""
+    """Compiled `StateEstimate.update`: returns the states (N, 5) for the rows of `Observations`
+    `seen` (N, OBSERVED). The memories (N,) `memory` and `delays` are updated in place."""
     states = np.empty((len(seen), STATES))
     for k in range(len(seen)):
         states[k] = estimate_state(seen[k], wheel_angles[k], memory[k], delays[k], table, dt)
@@ -119,7 +120,8 @@ def estimate_states(
 def estimate_state(
     seen: Vector, wheel_angle: float, memory: Any, delay: Any, table: Vector, dt: float
 ) -> Vector:
-    """The present state (5,) of one car from its observation (OBSERVED,)."""
+    """Return the present state (5,) of one car after its observation `seen` (OBSERVED,). `memory`
+    and `delay` are updated in place."""
     own, x, last = memory.own, memory.x, memory.last
     note_finite(0, seen[TO_LANE_CENTRE], last)
     note_finite(1, -seen[ANGLE], last)
@@ -177,7 +179,10 @@ def note_noise(measured: Vector, memory: Any) -> None:
 
 @lru_cache(maxsize=8)
 def transitions(dt: float) -> Vector:
-    """Exact transitions (speeds, 5, 6) from state and wheel angle (rad) over `dt` s, by speed."""
+    """Return the exact transition matrices over `dt` s, (speeds, 5, 6), for the speeds of the grid.
+
+    A matrix times the state (5) and the wheel angle (rad) is the next state.
+    """
     speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
     return np.array([_transition(float(speed), dt) for speed in speeds])
 
@@ -209,9 +214,9 @@ def advance(
     """One control step of the filter; returns the present state (5,).
 
     `x` (5,) and `covariance` (5, 5) are the state at the moment of the image, `delay` steps ago;
-    both are updated in place. `own` (n, 4): vx, vy, yaw rate and wheel angle, newest first. The
-    first two elements of `seen` are e and theta of the image. `variance` (4,): variances of the
-    measurements. `process` (5,): variances of the model's error.
+    both are updated in place. `table`: the result of `transitions`. `own` (n, 4): vx, vy, yaw rate
+    and wheel angle, newest first. The first two elements of `seen` are e and theta of the image.
+    `variance` (4,): variances of the measurements. `process` (5,): variances of the model's error.
     """
     predict(x, covariance, table, own[delay + 1, 0], own[delay + 1, 3], process)
     correct(x, covariance, V, own[delay, 1], variance[V])
@@ -230,7 +235,10 @@ def advance(
 def predict(
     x: Vector, covariance: Vector, table: Vector, vx: float, wheel: float, process: Vector
 ) -> None:
-    """Replace state (5,) and covariance (5, 5) by their predictions for the next control step."""
+    """Replace state `x` (5,) and covariance (5, 5) by their predictions for the next control step.
+
+    `vx` (m/s) and `wheel` (rad) are the speed and the wheel angle during the step.
+    """
     place = (min(max(vx, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
     low = min(int(place), len(table) - 2)
     share = place - low
@@ -256,7 +264,7 @@ def predict(
 
 @compiled
 def correct(x: Vector, covariance: Vector, index: int, value: float, variance: float) -> None:
-    """Correct state (5,) and covariance (5, 5) by a measurement of one of the states."""
+    """Correct state `x` (5,) and covariance (5, 5) by a measurement `value` of `x[index]`."""
     gain = covariance[:, index] / (covariance[index, index] + variance)
     row = covariance[index].copy()
     x += gain * (value - x[index])

@@ -2,7 +2,7 @@
 
 Both act on the state that `controllers.laws.kalman` estimates: the present offset and heading
 error, lateral speed and yaw rate without their noise, and the curvature of the road. The paper's
-controllers use the perceived values unchanged. With 5 cm of noise they steer to and fro; with a
+controllers use the perceived values unchanged: with 5 cm of noise they steer to and fro, and with a
 delay of 0.1 s they oscillate.
 
 `LqrKalman` (`lqr-kalman`) minimises the paper's cost plus `wheel_rate` times the squared change of
@@ -41,7 +41,7 @@ from controllers.laws.steering import STEERING_LOCK, steer_for
 from runtime.jit import compiled_for_threads
 
 APPROACH_RAD = 0.3
-"""Largest heading error (rad) at which the car returns to the line."""
+"""Largest heading error (rad) with which `LqrKalman` drives the car back to the line."""
 
 
 WEIGHTS, WHEEL_RATE = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01), 3.0
@@ -66,7 +66,7 @@ def make_mpc_kalman(loop: LoopConfig, **weights: float) -> "MpcKalman":
 class LqrKalman(BatchController):
     """Linear quadratic regulator on the estimated state at a control step of `dt` s.
 
-    `delay_s`: the delay of the perception, if it is known; otherwise it is estimated.
+    `delay_s`: the delay of the perception, s; None if it must be estimated.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class LqrKalman(BatchController):
 class MpcKalman(BatchController):
     """Model predictive control on the estimated state at a control step of `dt` s.
 
-    `delay_s`: the delay of the perception, if it is known; otherwise it is estimated.
+    `delay_s`: the delay of the perception, s; None if it must be estimated.
     """
 
     def __init__(
@@ -132,9 +132,9 @@ def regulate_smoothly(
     cautious: Matrix,
     steady_bends: Matrix,
 ) -> Matrix:
-    """The steering actions (N,) of `LqrKalman` for cars at `speeds` (N,) with estimated `states`
-    (N, 5) and `delays` (N,). `wheel_angles` (N,) is updated in place; the remaining arguments are
-    rows of tables by speed."""
+    """Return the steering actions (N,) of `LqrKalman` for cars at `speeds` (N,) with estimated
+    `states` (N, 5) and `delays` (N,). `wheel_angles` (N,) is updated in place. The last three
+    arguments are results of `speed_table`."""
     steers = np.empty(len(states))
     for k in range(len(states)):
         offset, theta, curvature = states[k, E], states[k, THETA], states[k, KAPPA]
@@ -154,10 +154,10 @@ def regulate_smoothly(
 
 
 def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float) -> Matrix:
-    """The gain K (5,) of the law change = -K x.
+    """Return the gain K (5,) of the law change = -K x.
 
-    x is (e1, e1', e2, e2', wheel angle) minus the set points of these values. The change, in rad,
-    is the change of the wheel angle over one control step of `dt` s at `speed` m/s.
+    x is (e1, e1', e2, e2', wheel angle) minus the set points of these values. `change` is the
+    change of the wheel angle (rad) over one control step of `dt` s at `speed` m/s.
     """
     A, B = CAR.discretise(speed, dt)
     states = np.block([[A, B], [np.zeros((1, 4)), np.eye(1)]])

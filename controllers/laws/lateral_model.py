@@ -31,7 +31,8 @@ class LateralModel:
     rear_stiffness: float = 80_000.0
 
     def matrices(self, speed: float) -> tuple[Matrix, Matrix, Matrix]:
-        """A (4, 4), B (4, 1) and the column (4, 1) of the road's turning rate, at `speed` m/s."""
+        """Return A (4, 4), B (4, 1) and turn (4, 1) of x' = A x + B delta + turn * road's turning
+        rate (rad/s), with the wheel angle delta (rad), at `speed` m/s."""
         m, inertia, lf, lr = self.mass, self.yaw_inertia, self.front_axle, self.rear_axle
         front, rear = 2.0 * self.front_stiffness, 2.0 * self.rear_stiffness
         total, moment = front + rear, -front * lf + rear * lr
@@ -49,7 +50,8 @@ class LateralModel:
         return A, B, turn
 
     def discretise(self, speed: float, dt: float) -> tuple[Matrix, Matrix]:
-        """A (4, 4) and B (4, 1) over a control step of `dt` s at a constant wheel angle, exact."""
+        """Return the exact A (4, 4) and B (4, 1) of x[k+1] = A x[k] + B delta[k] for control steps
+        of `dt` s with a constant wheel angle, at `speed` m/s."""
         A, B, _ = self.matrices(speed)
         block = np.zeros((5, 5))
         block[:4, :4], block[:4, 4:] = A, B
@@ -57,7 +59,7 @@ class LateralModel:
         return step[:4, :4], step[:4, 4:]
 
     def cornering(self, speed: float) -> tuple[float, float]:
-        """Wheel angle and e2 per unit of curvature, rad m, in a steady bend with e1 = 0.
+        """Return wheel angle and e2 over the road's curvature, rad m, in a steady bend with e1 = 0.
 
         e2 is not zero in a bend: the car's heading differs from its path by the slip angle.
         """

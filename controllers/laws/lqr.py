@@ -69,12 +69,13 @@ WEIGHTS_BRIEFLY_TRAINED = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0)
 """Soft weights for the errors of a model trained for minutes (score per step on images of g-track-3
 with the shipped model: 0.9717)."""
 APPROACH_RAD = 0.15
-"""Largest heading error (rad) at which `Lqr` and `LqrPreview` return to the line on perception."""
+"""Largest heading error (rad) with which `Lqr` and `LqrPreview` drive back to the line on
+perception."""
 UNLIMITED_RAD = 1e6
 """The value of `approach_rad` that sets no limit, for the exact state."""
 LOCK_DEG = 21.0
 RATE = 3
-"""Size of the memory of a rate: whether there was a value, the last value, the rate."""
+"""Size of the memory of `next_rate`: 1 after the first value, else 0; the last value; the rate."""
 
 
 def make_lqr(loop: LoopConfig, **weights: float) -> "Lqr":
@@ -100,8 +101,8 @@ def make_lqr_paper(loop: LoopConfig, **weights: float) -> "LqrPaper":
 
 
 def approach_limit(loop: LoopConfig) -> float:
-    """Largest heading error (rad) at which the car returns to the line; unlimited for the exact
-    state."""
+    """Return the largest heading error (rad) with which the car drives back to the line; unlimited
+    for the exact state."""
     return APPROACH_RAD if loop.noisy else UNLIMITED_RAD
 
 
@@ -176,16 +177,16 @@ class LqrPaper(BatchController):
         return regulate_as_released(observations.rows, self._gains, self._rates, self.dt)
 
 
-# The compiled laws return the steering actions (N,). `seen` are the rows of `Observations`
-# (N, OBSERVED), `gains` the rows of a `speed_table`.
+# In the compiled laws `seen` is `Observations.rows` (N, OBSERVED), and `gains` is the result of
+# `speed_table`.
 
 
 @compiled_for_threads
 def regulate(
     seen: Matrix, gains: Matrix, rates: Matrix, dt: float, blend: float, approach_rad: float
 ) -> Matrix:
-    """The law of `Lqr`. `rates` (N, RATE), the memory of the rate of the heading error, is updated
-    in place."""
+    """Return the steering actions (N,) of `Lqr`. `rates` (N, RATE), the memory of the rate of the
+    heading error, is updated in place."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         vx, theta = seen[k, VX], -seen[k, ANGLE]
@@ -213,8 +214,8 @@ def regulate_with_preview(
     filter_s: float,
     approach_rad: float,
 ) -> Matrix:
-    """The law of `LqrPreview`. `curvatures` (N,), the estimates for cars without a measured
-    curvature, are updated in place."""
+    """Return the steering actions (N,) of `LqrPreview`. `curvatures` (N,), the estimates (1/m) for
+    cars without a measured curvature, is updated in place."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         vx, theta, yaw_rate = seen[k, VX], -seen[k, ANGLE], seen[k, YAW_RATE]
@@ -238,8 +239,8 @@ def regulate_with_preview(
 
 @compiled_for_threads
 def regulate_as_released(seen: Matrix, gains: Matrix, rates: Matrix, dt: float) -> Matrix:
-    """The law of `LqrPaper`. `rates` (N, 2, RATE), the memory of the rates of offset and heading,
-    is updated in place."""
+    """Return the steering actions (N,) of `LqrPaper`. `rates` (N, 2, RATE), the memory of the rates
+    of offset and heading error, is updated in place."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         offset, theta = seen[k, TO_LANE_CENTRE], -seen[k, ANGLE]
@@ -256,13 +257,15 @@ def limited(value: float, limit: float) -> float:
 
 
 def blend_for(dt: float, filter_s: float) -> float:
-    """The factor of a low-pass filter with the time constant `filter_s` on a rate."""
+    """Return the weight (0 to 1) of a new value in a low-pass filter with the time constant
+    `filter_s`, at steps of `dt`; both in s."""
     return dt / (dt + filter_s)
 
 
 @compiled
 def next_rate(memory: Matrix, value: float, dt: float, blend: float) -> float:
-    """The rate of `value` from its difference over a control step, low-pass filtered.
+    """Return the rate of change of `value`, its difference over a control step of `dt` s, low-pass
+    filtered with the weight `blend`.
 
     The rate of the first value is 0. `memory` (RATE,) is updated in place.
     """

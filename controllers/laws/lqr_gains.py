@@ -1,4 +1,4 @@
-"""Gains of the linear quadratic regulator for the lateral model, by speed. SI units."""
+"""Computes the gains of the linear quadratic regulator for a grid of speeds. SI units."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,22 +54,24 @@ def clqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
 
 
 def discrete_gain(model: LateralModel, weights: LqrWeights, speed: float, dt: float) -> Matrix:
-    """Gain K (4,) in rad per unit of (e1, e1', e2, e2') at one speed (m/s) and control step (s)."""
+    """Return the gain K (4,), rad per unit of (e1, e1', e2, e2'), at one `speed` (m/s) for control
+    steps of `dt` s."""
     A, B = model.discretise(speed, dt)
     gain: Matrix = dlqr(A, B, weights.Q, weights.R)[0]
     return gain
 
 
 def speed_table(compute: Callable[[float], Matrix | tuple[float, ...]]) -> Matrix:
-    """The results (speeds, n) of `compute` at each speed (m/s) of the grid, for `row_at`."""
+    """Return the results (speeds, n) of `compute` for the speeds (m/s) of the grid. `row_at` reads
+    them."""
     speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
     return np.array([compute(float(speed)) for speed in speeds])
 
 
 @compiled
 def row_at(rows: Matrix, speed: float) -> Matrix:
-    """The row (n,) at `speed` m/s of the `rows` (speeds, n) of a `speed_table`: interpolated
-    linearly, constant outside the grid."""
+    """Return the row (n,) for `speed` m/s of `rows` (speeds, n), a result of `speed_table`. It is
+    interpolated linearly in the grid, and constant outside."""
     place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
     low = min(int(place), len(rows) - 2)
     share = place - low

@@ -47,7 +47,7 @@ from simulator.vehicle.car import CarParameters
 Vector = NDArray[np.float64]
 
 HORIZON = 10
-"""Control steps; the paper compares 8, 10 and 12."""
+"""Control steps of a plan; the paper compares 8, 10 and 12."""
 REAR_AXLE_M, WHEELBASE_M = CarParameters.rear_axle, CarParameters().wheelbase
 CURVATURE_FILTER_S = 0.4
 MAX_ITERATIONS = 30
@@ -115,11 +115,11 @@ class Mpc(BatchController):
 def plan_cars(
     seen: Vector, plans: Vector, curvatures: Vector, preview: bool, dt: float, cost: Vector
 ) -> Vector:
-    """The steering actions (N,) for the rows of `Observations` (N, OBSERVED).
+    """Return the steering actions (N,) for `seen`, the rows of `Observations` (N, OBSERVED).
 
-    The plans (N, n) of the last step are replaced by the new plans. Where no curvature is measured,
-    its estimate in `curvatures` (N,) is updated, too. Without `preview` the curvature of the
-    reference is 0.
+    The `plans` (N, n) of the last step are replaced by the new plans. With `preview` the reference
+    has the measured curvature of the road, or, where it is not measured, the estimate in
+    `curvatures` (N,), which is updated in place. Without `preview` its curvature is 0.
     """
     steers = np.empty(len(seen))
     for k in range(len(seen)):
@@ -140,8 +140,8 @@ def plan_cars(
 
 @compiled
 def roll_out(plan: Vector, speed: float, dt: float, states: Vector) -> None:
-    """Fill `states` (n + 1, 2), y (m) and psi (rad), from its first row under the wheel angles
-    `plan` (n,)."""
+    """Fill `states` (n + 1, 2), y (m) and psi (rad): its first row is the start, the others follow
+    from the wheel angles `plan` (n,) at `speed` m/s and steps of `dt` s."""
     for k in range(len(plan)):
         slope = math.tan(plan[k])
         slip = math.atan(REAR_AXLE_M / WHEELBASE_M * slope)
@@ -153,7 +153,8 @@ def roll_out(plan: Vector, speed: float, dt: float, states: Vector) -> None:
 def plan_cost(
     plan: Vector, states: Vector, speed: float, dt: float, curvature: float, cost: Vector
 ) -> float:
-    """The cost of `plan` (n,), which leads to `states` (n + 1, 2)."""
+    """Return the cost of `plan` (n,), which leads to `states` (n + 1, 2); `cost` (3,) has the
+    weights and `curvature` (1/m) belongs to the reference."""
     total = 0.0
     for k in range(len(plan)):
         turned = curvature * speed * dt * (k + 1)
@@ -173,8 +174,8 @@ def backward_pass(
     cost: Vector,
     steps: Vector,
 ) -> None:
-    """Fill `steps` (n, 3): the change of each wheel angle, within the lock, and its feedback gains
-    on the changes of y and psi."""
+    """Fill `steps` (n, 3) from the last step to the first: the change of each wheel angle, within
+    the lock, and its feedback gains on the changes of y and psi."""
     n = len(plan)
     share = REAR_AXLE_M / WHEELBASE_M
     gy = gp = hyy = hyp = hpp = 0.0  # gradient and Hessian of the cost to go

@@ -1,4 +1,4 @@
-"""A trained actor as a controller; one `update` is three small matrix products in numpy."""
+"""A controller that steers by a trained actor; one `update` is three small numpy products."""
 
 import math
 from dataclasses import replace
@@ -13,8 +13,8 @@ from controllers.laws.actor_state import EXACT, STEP_S, StateBuilder, paper_stat
 from trackfeatures.errors import UserError
 
 FARTHEST_M = 1.0
-"""Limit of the offset on perception. From further away an actor returns at an angle of 0.3 rad, but
-the shipped model answers 0.25 rad at most."""
+"""Largest offset (m) that an actor receives on perception. At larger offsets an actor turns the car
+by 0.3 rad towards the lane, but the shipped model's angle is 0.25 rad at most."""
 SHIPPED = Path(__file__).parent.parent / "weights"
 
 
@@ -36,7 +36,7 @@ class RlController:
         return self._states.steer(self._actor.steer(self._states.build(paper, observation)))
 
     def update_batch(self, observations: Observations) -> NDArray[np.float64]:
-        # Car by car: a product of matrices has other last bits for each number of cars.
+        # Each car separately: the rounding of a matrix product depends on the number of rows.
         if len(self._cars) != len(observations):
             self._cars = [RlController(self._actor, self._loop) for _ in range(len(observations))]
         pairs = zip(self._cars, observations.split(), strict=True)
@@ -44,7 +44,7 @@ class RlController:
 
 
 def load_controller(folder: Path, loop: LoopConfig = EXACT) -> RlController:
-    """The controller of the actor in `folder`.
+    """Load the actor in `folder` as a controller.
 
     Raises ActorError for unusable files and UserError for a control step other than the control
     step of the training.
@@ -55,10 +55,10 @@ def load_controller(folder: Path, loop: LoopConfig = EXACT) -> RlController:
 
 
 def make_rl(loop: LoopConfig) -> RlController:
-    """The shipped actor of the paper's state. Raises UserError as `load_controller` does."""
+    """Load the shipped actor of the paper's state. Raises UserError unless `loop.dt` is STEP_S."""
     return load_controller(SHIPPED / "rl", loop)
 
 
 def make_rl_residual(loop: LoopConfig) -> RlController:
-    """The shipped actor that corrects LQR. Raises UserError as `load_controller` does."""
+    """Load the shipped actor that corrects LQR. Raises UserError unless `loop.dt` is STEP_S."""
     return load_controller(SHIPPED / "rl-residual", loop)

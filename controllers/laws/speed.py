@@ -37,7 +37,8 @@ AllowedSpeed = Callable[[CarState, Perceived], float]
 class SpeedHold:
     """Pedals that hold `speed` m/s; called once for each control step of `dt` s.
 
-    Raises UserError for a speed out of range.
+    `slope` returns the slope of the road (rise over run). Raises UserError for a speed out of
+    range.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class SpeedHold:
     def __call__(
         self, now: CarState, traffic: Traffic, perceived: Perceived
     ) -> tuple[float, float, int]:
-        """Throttle, brake and gear."""
+        """Return throttle (0 to 1), brake (0 to 1) and gear for the present control step."""
         target = min(self._speed, self._allowed(now, perceived))
         pressed = self._target.command(now, traffic, target, self._slope(now))
         free = target == self._speed and not self._target.following
@@ -76,7 +77,7 @@ class SpeedHold:
 
 
 def on_the_truth(speed: float, road: Road, lane_centre: float, dt: float) -> SpeedHold:
-    """Pedals that brake before bends, whose curvature is known.
+    """Return pedals that hold `speed` m/s and brake before the bends of `road`.
 
     `lane_centre` is the line to follow, m left of the track's centre.
     """
@@ -89,7 +90,8 @@ def on_the_truth(speed: float, road: Road, lane_centre: float, dt: float) -> Spe
 
 
 def on_perception(speed: float, dt: float) -> SpeedHold:
-    """Pedals that slow down in bends, detected by the yaw rate and the perceived class of the road.
+    """Return pedals that hold `speed` m/s and slow down in bends, which they detect by the yaw rate
+    and the perceived class of the road.
 
     The slope is the pitch of the body, as an inclination sensor measures it.
     """
@@ -103,7 +105,7 @@ class CornerSpeed:
         self._dt = dt
         self._curvature = CurvatureEstimate(dt)
         self._turn = 0.0
-        """Class of the road, left 1, straight 0, right -1, low-pass filtered."""
+        """Class of the road (left 1, straight 0, right -1), low-pass filtered."""
         self._side = 0
         self._bend_s = math.inf
         """Time (s) since the class announced a bend."""

@@ -1,4 +1,4 @@
-"""The steering action of a front wheel angle; left is positive in both."""
+"""Converts a front wheel angle to a steering action; left is positive in both."""
 
 from runtime.jit import callable_from_compiled
 from simulator.vehicle.car import CarParameters
@@ -9,5 +9,5 @@ STEERING_LOCK = CarParameters.steering_lock
 
 @callable_from_compiled
 def steer_for(wheel_angle: float) -> float:
-    """The steering action in [-1, 1] for a front wheel angle (rad)."""
+    """Return the steering action in [-1, 1] for a front wheel angle (rad)."""
     return max(-1.0, min(1.0, wheel_angle / STEERING_LOCK))

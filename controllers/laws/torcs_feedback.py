@@ -1,10 +1,10 @@
-"""The state feedback that drove the reference laps of the real TORCS.
+"""The state feedback that drove the laps recorded in TORCS, to which the simulated car is compared.
 
 front wheel angle (rad) = -(1.0 d + 0.1 (vy + vx sin theta) + 2.0 theta + 0.1 yaw rate)
 
 with the offset d (m, left positive), the speeds vx and vy (m/s, body frame), the heading error
 theta (rad, counter-clockwise) and the yaw rate (rad/s). The law has no model and no feed-forward.
-It validates the simulated car: under the same law the simulator must drive the same laps as TORCS.
+With the same law the simulated car must drive the same laps as the car of TORCS.
 """
 
 import math
@@ -30,12 +30,12 @@ OFFSET, OFFSET_RATE, HEADING_ERROR, TURN = 1.0, 0.1, 2.0, 0.1
 
 
 def make_torcs(loop: LoopConfig) -> "StateFeedback":
-    """The law, which does not depend on the control loop."""
+    """Make a `StateFeedback`; it does not depend on `loop`."""
     return StateFeedback()
 
 
 class StateFeedback(BatchController):
-    """The law, with the gains of the module's formula."""
+    """Steers by the formula at the top of this module."""
 
     def update_batch(self, observations: Observations) -> Matrix:
         return feed_back(observations.rows)
@@ -43,7 +43,7 @@ class StateFeedback(BatchController):
 
 @compiled_for_threads
 def feed_back(seen: Matrix) -> Matrix:
-    """The steering actions (N,) for the rows of `Observations` (N, OBSERVED)."""
+    """Return the steering actions (N,) for `seen`, the rows of `Observations` (N, OBSERVED)."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         theta = -seen[k, ANGLE]
