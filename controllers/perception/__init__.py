@@ -1,1 +1,1 @@
-"""What a controller knows of the road: sources of perception, late and uncertain answers."""
+"""Perception of the road for a controller: its sources, and late, lost or uncertain answers."""

@@ -15,10 +15,11 @@ LEFT, RIGHT = int(RoadClass.LEFT), int(RoadClass.RIGHT)
 def next_curvature(
     value: float, yaw_rate: float, vx: float, heading: float, dt: float, filter_s: float
 ) -> float:
-    """The estimate (1/m, left positive) after a control step, from the estimate `value` before it.
+    """Return the estimate (1/m, left positive) after a control step, from the estimate `value`
+    before it.
 
-    It is the yaw rate over the speed, low-pass filtered. Its sign does not contradict the class of
-    the road.
+    It is the yaw rate over the speed, low-pass filtered with the time constant `filter_s` (s). It
+    is not negative where the class of the road, `heading`, is left, and not positive where right.
     """
     turning = yaw_rate / max(vx, SLOWEST_M_S)
     value += dt / (dt + filter_s) * (turning - value)
@@ -41,7 +42,7 @@ class CurvatureEstimate:
     value: float = 0.0
 
     def __call__(self, observation: Observation) -> float:
-        """The estimate after this step."""
+        """Return the estimate (1/m) after the control step of `observation`."""
         yaw_rate, vx, heading = observation.yaw_rate, observation.vx, observation.heading
         self.value = next_curvature(self.value, yaw_rate, vx, heading, self.dt, self.filter_s)
         return self.value

@@ -1,4 +1,5 @@
-"""Perception with latency and lost answers, which a prediction bridges. SI units.
+"""Perception with latency and lost answers; the state is predicted until an answer arrives. SI
+units.
 
 An answer describes the moment of its image. The car moves on until it arrives, so the offset and
 the angle are predicted to the present from the car's own speeds and yaw rate:
@@ -40,7 +41,7 @@ class _Moment:
 
 
 class StatePredictor:
-    """Predicts an answer over the control steps since its image, of at most `longest_s`."""
+    """Predicts an answer from the moment of its image to the present, over at most `longest_s`."""
 
     def __init__(self, dt: float, longest_s: float) -> None:
         self._dt = dt
@@ -53,14 +54,15 @@ class StatePredictor:
         self._moments.append(_Moment(now.vx, now.vy, now.yaw_rate, self._curvature(seen)))
 
     def predict(self, answer: Perceived, age: int, until: int = 0) -> Perceived:
-        """The answer to the image of `age` control steps ago, predicted to `until` steps ago."""
+        """Return `answer`, whose image is `age` control steps old, predicted from the moment of the
+        image to the moment `until` steps ago."""
         if age == until or answer.to_lane_centre is None:
             return answer
         moments = list(self._moments)
         past = moments[-age - 1 : len(moments) - until]
         offset, theta = answer.to_lane_centre, -answer.angle
         for before, after in itertools.pairwise(past):
-            # The mean over the step, because the sensors of both its ends are known.
+            # The mean over the step: the motion at its begin and at its end is measured.
             vx, vy = 0.5 * (before.vx + after.vx), 0.5 * (before.vy + after.vy)
             curvature = before.curvature if answer.curvature is None else answer.curvature
             turn = 0.5 * (before.yaw_rate + after.yaw_rate) - curvature * vx
@@ -71,7 +73,7 @@ class StatePredictor:
 
 
 class RoadEstimate:
-    """The estimate of the road: received answers, fused (see `trust`) and predicted to the present.
+    """The estimate of the road: received answers are fused by `Trust` and predicted to the present.
 
     Call `update` once for each control step, then `present`. With `predict=False` the estimate is
     the newest answer, unchanged.
@@ -105,7 +107,8 @@ class RoadEstimate:
         return self._trust.correct(known, arrived, steps, steps * self.dt * speed)
 
     def present(self, due: int) -> Perceived:
-        """The road now; an answer is overdue from `due` control steps after its image."""
+        """Return the road at this step. An answer to an image of `due` steps ago is not late, so
+        `lost_s` counts the time from then on."""
         waited_s = max(self._age - due, 0) * self.dt
         if self._last is None or waited_s > LOST_S:
             return Perceived(None, 0.0, self._heading, None, lost_s=waited_s)
@@ -132,7 +135,7 @@ class TrustedPerception(Generic[World]):
         self._estimate = RoadEstimate(dt)
 
     def __call__(self, world: World) -> Perceived:
-        """The road now, as the controller receives it."""
+        """Return the estimate of the road at this control step, for the controller."""
         answer = self._perceive(world)
         blind = answer.to_lane_centre is None
         self._estimate.update(self._state(world), None if blind else answer, 0)
@@ -146,8 +149,8 @@ def check_drop(drop: float) -> None:
 
 
 def delay_steps(latency_s: float, dt: float) -> int:
-    """The control steps of `dt` s by which answers are late, rounded up. Raises UserError for a
-    latency out of range."""
+    """Return a latency in control steps of `dt` s, rounded up. Raises UserError for a latency below
+    0 or above LOST_S."""
     if not 0.0 <= latency_s <= LOST_S:
         raise UserError(f"a latency of {1000 * latency_s:g} ms; give 0 to 1000 ms")
     return math.ceil(latency_s / dt - 1e-9)
@@ -181,7 +184,7 @@ class LatePerception(Generic[World]):
         self.lost_answers = 0
 
     def __call__(self, world: World) -> Perceived:
-        """The road now, as the controller receives it."""
+        """Return the estimate of the road at this control step, for the controller."""
         lost = self._rng.random() < self._drop
         answer = self._perceive(world)
         self.lost_answers += lost

@@ -1,4 +1,4 @@
-"""The output of a perception: the road as a controller receives it. m, rad, 1/m; left positive."""
+"""The output of a perception, which a controller receives. SI units, left positive."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -14,14 +14,14 @@ class Perceived:
     """The road at one control step."""
 
     to_lane_centre: float | None
-    """m from the centre of the lane to follow; None if no marking is visible."""
+    """Offset (m) from the centre of the lane to follow; None if no marking is visible."""
     angle: float
-    """rad, positive when the car points to the right of the track."""
+    """Heading angle, rad, positive when the car points to the right of the track."""
     heading: RoadClass
     curvature: float | None = None
-    """1/m, of the road just ahead; None if the perception does not estimate it."""
+    """Curvature (1/m) of the road just ahead; None if the perception does not estimate it."""
     lost_s: float = 0.0
-    """How long answers have been overdue or untrusted, s; 0 if the answer of this step arrived."""
+    """Time (s) for which answers have been late or untrusted; 0 if this step's answer is there."""
     offset_std_m: float | None = None
     """Standard deviation of the error of `to_lane_centre`; None if it is not estimated."""
     angle_std_rad: float | None = None

@@ -1,4 +1,4 @@
-"""Asynchronous perception in real time: a step uses the newest received answer. SI units.
+"""Asynchronous perception in real time: a control step uses the newest received answer. SI units.
 
 The thread that steps the world also renders, because an OpenGL context belongs to one thread. A
 second thread sends requests to the model or the service, one at a time. During a request only the
@@ -61,7 +61,7 @@ class AnswerSource(Protocol[Request, Answer]):
 
 
 class ImmediateAnswers(Generic[Answer]):
-    """The source of a perception without requests: the frame is the answer."""
+    """An `AnswerSource` for a perception that needs no requests: each frame is its own answer."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
@@ -119,12 +119,12 @@ class RequestThread(Generic[Frame, Answer]):
 
 @dataclass(frozen=True, slots=True)
 class RealTimeFigures:
-    """How well a drive kept to the wall clock."""
+    """Times of the answers and of the control steps of a drive in real time."""
 
     late_answers: int
     """Answers that took longer than a control step."""
     lost_answers: int
-    """Answers that were lost on request."""
+    """Answers that were dropped on purpose (--drop)."""
     answer_ms_median: float
     """Time from an image to its answer."""
     answer_ms_p99: float
@@ -168,7 +168,7 @@ class RealTimePerception(Generic[World, Frame, Answer]):
         self._missed = self._lost_answers = 0
 
     def __call__(self, world: World) -> Perceived:
-        """The road now, as the controller receives it; waits until the control step is due."""
+        """Wait until the control step is due; returns the estimate of the road."""
         self._step += 1
         if self._step == 0:
             return self._begin(world)
@@ -197,11 +197,11 @@ class RealTimePerception(Generic[World, Frame, Answer]):
     def _know(self, world: World, newest: Perceived | None, age: int) -> Perceived:
         self._estimate.update(self._state(world), newest, age)
         self._ages_s.append(self._clock() - self._requested_s)
-        # An answer to the image of the last step is on time.
+        # The answer to the image of the last step is not late.
         return self._estimate.present(due=1)
 
     def figures(self) -> RealTimeFigures:
-        """The figures of the steps so far."""
+        """Return the figures of all control steps so far."""
         waits_ms = 1000.0 * np.array(self._waits_s or [0.0])
         ages_ms = 1000.0 * np.array(self._ages_s or [0.0])
         return RealTimeFigures(
@@ -224,7 +224,7 @@ class RealTimePerception(Generic[World, Frame, Answer]):
 def real_time(
     perceive: Perceive, *, dt: float, drop: float, rng: np.random.Generator
 ) -> RealTimePerception["SimulatedWorld", Any, Any]:
-    """`perceive` in real time; `drop` is the share of answers to lose, drawn from `rng`.
+    """Return `perceive` in real time. A share `drop` of the answers, random by `rng`, is lost.
 
     Only a perception with a camera takes time to answer. Raises UserError for `drop` out of range.
     """

@@ -23,24 +23,25 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 LOOK_AHEAD_S = 0.1
-"""Driving time (s) ahead at which the ground truth gives the curvature: about the delay of steering
-and tyres."""
+"""The ground truth contains the curvature at the point that the car reaches after this time (s),
+which is about the delay of steering and tyres."""
 
 
 class FeatureModel(Protocol):
-    """A network as `CameraPerception` uses it: its camera, and its prediction for an image."""
+    """The part of a model that `CameraPerception` uses: its camera and its predictions."""
 
     camera: CameraParameters
 
     def predict(self, image: Image) -> dict[str, Any]:
-        """The prediction for an image (H, W, 3) RGB, in the format of the service's answers."""
+        """Return the prediction for an RGB image (H, W, 3), in the format of a service's answer."""
 
     def close(self) -> None:
-        """Release what the model holds open."""
+        """Close the model's connection, if it has one."""
 
 
 def truth(lane_centre: float) -> Perceive:
-    """The exact features; the offset is from the line at `lane_centre` (m, left positive)."""
+    """Return a perception that measures exactly; its offset is measured from the line `lane_centre`
+    (m left of the track's centre)."""
 
     def perceive(world: "World") -> Perceived:
         now = world.state
@@ -71,7 +72,7 @@ class LocalModel:
         return self._decode(self._engine(image)).as_json()
 
     def close(self) -> None:
-        """Do nothing: the model holds nothing open."""
+        """Do nothing: the model has no connection."""
 
 
 class ServiceModel:
@@ -98,7 +99,7 @@ class ServiceModel:
 
 
 def parse_camera(content: Any) -> CameraParameters:
-    """The camera in a service's model card. Raises UserError for a missing or incomplete camera."""
+    """Read the camera in a service's model card. Raises UserError if a value is missing."""
     try:
         return CameraParameters(
             width=int(content["width"]),
@@ -131,23 +132,25 @@ class CameraPerception:
         return self.read(self.ask(self.capture(world)))
 
     def capture(self, world: "World") -> Image:
-        """The image of the present state. Call it in the thread that opened the camera."""
+        """Render the image of the present state. Call it in the thread that opened the camera."""
         image: Image = self.camera.render(world.body_pose(), world.traffic.poses())
         self.image = image
         return image
 
     def ask(self, image: Image) -> dict[str, Any]:
-        """The model's answer. Call it in any thread, but never in two threads at the same time."""
+        """Return the model's answer to `image`. Call it in any thread, but not in two at once."""
         return self._model.predict(image)
 
     def read(self, answer: dict[str, Any]) -> Perceived:
-        """The quantities of an answer that steering needs; raises as `parse_prediction` does."""
+        """Store a model's answer and convert it for a controller. Raises UserError for a missing or
+        non-finite quantity."""
         self.answer = answer
         return parse_prediction(answer)
 
 
 def parse_prediction(answer: dict[str, Any]) -> Perceived:
-    """The quantities that steering needs. Raises UserError for a missing or non-finite quantity."""
+    """Convert a service's answer for a controller. Raises UserError for a missing or non-finite
+    quantity."""
     try:
         offset, angle = answer["to_lane_centre_m"], float(answer["angle_rad"])
         probabilities = [float(answer["heading"][heading.name.lower()]) for heading in RoadClass]
@@ -195,7 +198,7 @@ def check_perception(name: str, model: str) -> None:
 def open_perception(
     name: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
 ) -> Iterator[Perceive]:
-    """The perception called `name`: "truth", "model" (the run `model`), or a service's address.
+    """Open the perception `name`: "truth", "model" (the run `model`), or a service's address.
 
     `lane_centre` (m, left positive) is the centre of the lane to follow; `light` and `seed` set the
     scene of the images. Raises UserError for another name, a missing model, or a service that does

@@ -45,7 +45,7 @@ class Trust:
     def correct(
         self, known: Perceived | None, answer: Perceived, steps: int, moved_m: float
     ) -> Perceived:
-        """The state estimate after `answer`, from the estimate `known` before it.
+        """Fuse `answer` with the state estimate `known` and return the new state estimate.
 
         `known` has been propagated over `steps` control steps and `moved_m` metres since the last
         answer. It is None before the first answer and after a long time without one.
@@ -76,5 +76,6 @@ class Trust:
 
 
 def _joseph(variance: float, gain: float, std: float) -> float:
-    """The variance after a correction with any gain (Joseph form)."""
+    """Return the variance after the fusion, with any `gain`, with a measurement whose standard
+    deviation is `std` (Joseph form)."""
     return (1.0 - gain) ** 2 * variance + gain**2 * std**2

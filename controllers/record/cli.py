@@ -70,9 +70,9 @@ def record(config: RecordConfig, as_json: bool) -> None:
     """Record rounds with true labels while a controller steers on a model's answers.
 
     The rounds are planned like the rounds of `datagen collect`, with the same speeds and traffic.
-    The controller follows the course of a round, which sways and leaves the lane. A car that leaves
-    the road or hits something is put back onto the road. The same command continues an interrupted
-    dataset.
+    The controller follows the trajectory of a round, which sways and leaves the lane. A car that
+    leaves the road or hits something is put back onto the road. The same command continues an
+    interrupted dataset.
     """
     from controllers.record.law import MakePerceivedLaw
 
@@ -86,7 +86,8 @@ def record(config: RecordConfig, as_json: bool) -> None:
 
 
 def _plan(config: RecordConfig) -> "tuple[Plan, ClassShares]":
-    """The plan of the rounds, with the controller and the model, and its shares of road classes.
+    """Return the plan of the rounds, with the names of the controller and the model, and the
+    expected shares of the road classes.
 
     Raises UserError for a controller that cannot be made, or a model for another camera.
     """

@@ -1,8 +1,8 @@
 """The steering law of a recorded round: a controller on a model's perception.
 
-Course, speed, traffic and light of the round are the same as in `datagen collect`. The controller
-follows the course by the model's answer to each image, so that the car reaches the states to which
-the model's errors lead (DAgger, Ross et al. 2011). The recorded labels are the simulator's truth.
+Trajectory, speed, traffic and light of the round are the same as in `datagen collect`. The
+controller follows the trajectory by the model's answer to each image, so that the car reaches the
+states to which the model's errors lead (DAgger, Ross et al. 2011). The labels are the true values.
 
 Two inputs come from the simulator: the positions of the other cars, and the lane from which the
 answered offset is measured, because an image shows only the lane that the car is in.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class PerceivedLaw:
-    """A `datagen.driving.scripted_driver.SteeringLaw` that steers by perception; m and rad."""
+    """Steers a recorded round by perception, as a `datagen.driving.scripted_driver.SteeringLaw`."""
 
     def __init__(
         self, controller: str, loop: LoopConfig, perceive: Perceive, world: "World"
@@ -37,19 +37,20 @@ class PerceivedLaw:
         self.restart()
 
     def restart(self) -> None:
-        """Make a new controller and a new, empty memory of the road."""
+        """Make a new controller, and forget the last perceived offset."""
         self._controller: Controller = make_controller(self._name, self._loop)
         self._memory = OffsetMemory(round(HOLD_S / self._loop.dt))
 
     def road_curvature(self, state: CarState) -> float:
-        """0, because the model does not predict the curvature. A controller that needs it estimates
-        it."""
+        """Return 0: the model does not predict the curvature, and controllers estimate it
+        themselves."""
         return 0.0
 
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
-        """The steering action towards the path at `offset`, which has `path_angle` to the road."""
+        """Return the steering action towards a path, which is `offset` m left of the middle of the
+        road and turned by `path_angle` rad to the left of it."""
         perceived = self._perceive(self._world)
         error = None
         if perceived.to_lane_centre is not None:
@@ -66,10 +67,10 @@ class PerceivedLaw:
         )
 
     def _from_middle(self, to_lane_centre: float, true: float) -> float:
-        """The answered offset from the middle of the road; the lane is chosen by the `true` offset.
+        """Convert the model's offset from a lane's centre to an offset (m) from the road's middle.
 
-        The chosen lane brings the answer nearest to `true`, because near a marking the model can
-        answer for the adjacent lane.
+        Near a marking the model can answer for the adjacent lane. Therefore the lane is chosen for
+        which the result is nearest to the `true` offset.
         """
         road = self._world.road
         centres = (tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes))
@@ -78,7 +79,7 @@ class PerceivedLaw:
 
 @dataclass(frozen=True)
 class MakePerceivedLaw:
-    """A function that makes the law of a round; it is pickled for the recording processes."""
+    """Makes the steering law of a round when called; it is pickled for the recording processes."""
 
     controller: str
     model: str
@@ -91,5 +92,5 @@ class MakePerceivedLaw:
 
 @lru_cache(maxsize=1)
 def _load(model: str) -> FeatureModel:
-    """The model; it is loaded once in each process, for all its rounds."""
+    """Load a model, once in each process for all its rounds."""
     return LocalModel(model)
