@@ -1,4 +1,4 @@
-"""Discount factors and generalised advantage estimates (Schulman et al. 2016). SI units."""
+"""Discount factors, and generalised advantage estimation (Schulman et al. 2016). SI units."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,11 @@ def advantages_of(
     discounts: Array,
     gae_lambda: float,
 ) -> Array:
-    """Generalised advantage estimates (T, N).
+    """Return the generalised advantage estimates (T, N) of T steps of N cars.
 
-    All arrays are (T, N). `discounts`: the discount factors of the steps. `next_values`: values of
-    the states that the steps led to, before any reset; after a terminal state (`ended`) no reward
-    follows. An episode that is `over` passes nothing on to the next one.
+    All arrays are (T, N). `values`, `next_values`: values of the states before and after the steps,
+    the latter before any reset. `ended`: the step reached a terminal state, whose value is 0.
+    `over`: the step was the last one of its episode, so the sum over later steps stops here.
     """
     found = np.zeros_like(rewards)
     errors = rewards + discounts * next_values * ~ended - values
@@ -35,7 +35,7 @@ def advantages_of(
 
 
 def discounts_at(speeds: Array, length_m: float) -> Array:
-    """The discount factors of control steps at these speeds (m/s): exp(-distance / length_m)."""
+    """Return the discount factors exp(-distance / length_m) of control steps at `speeds` (m/s)."""
     distances = STEP_S * np.maximum(speeds, SLOWEST_M_S)
     factors: Array = np.exp(-distances / length_m).astype(np.float32)
     return factors

@@ -1,4 +1,4 @@
-"""The learning agent: actor, critics, replay of transitions, and updates."""
+"""The agent of DDPG and TD3: actor, critics, replay of transitions, and updates."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,11 +70,11 @@ class Agent:
         self._order, self._signs = mirror_of(definition)
 
     def see(self, state: Array) -> Array:
-        """The input of the networks for a state (size,)."""
+        """Return the input of the networks for states (..., size): the states over `divisor`."""
         return np.asarray(state / self.divisor, np.float32)
 
     def act(self, seen: Array) -> float:
-        """The action of the present actor for an input of the networks."""
+        """Return the present actor's action in [-1, 1] for an input (size,) of the networks."""
         rows = seen[None]
         if self.algorithm.mirrored:
             rows = np.stack([seen, seen[self._order] * self._signs])
@@ -95,7 +95,7 @@ class Agent:
         self.replay.add(seen, action, of.reward_scale * value, next_seen, ended)
 
     def act_all(self, seen: Array) -> Array:
-        """The actions (N,) of the present actor for inputs of the networks (N, size)."""
+        """Return the actions (N,) of the present actor for inputs (N, size) of the networks."""
         rows = seen
         if self.algorithm.mirrored:
             rows = np.concatenate((seen, seen[:, self._order] * self._signs))
@@ -107,7 +107,7 @@ class Agent:
         )
 
     def weights(self) -> dict[str, Array]:
-        """The arrays of the target actor as in an actor's file.
+        """Return the arrays of an actor's file (w1, b1, w2, b2, w3, b3) for the target actor.
 
         The target actor is an average over the last updates and steers more smoothly.
         """
@@ -116,13 +116,13 @@ class Agent:
         return flat | {name: flat[name].reshape(-1) for name in ("b1", "b2", "w3", "b3")}
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
+        """Return all arrays and counts that a continued training needs, by name."""
         filled = {name: array[: len(self.replay)] for name, array in self._replayed().items()}
         counts = {"updates": self.updates, "added": self.replay.added}
         return self._parameters() | filled, counts
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
-        """Continue from the arrays and counts of a checkpoint."""
+        """Restore the arrays and counts that `store` returned."""
         for name, array in self._parameters().items():
             array[:] = tensors[name]
         for name, array in self._replayed().items():
@@ -130,7 +130,7 @@ class Agent:
         self.updates, self.replay.added = counts["updates"], counts["added"]
 
     def _parameters(self) -> Tensors:
-        """Parameters and Adam's moments by name; they are not copied."""
+        """Return parameters and Adam's moments by name; they are not copied."""
         return {
             f"{name}.{part}": getattr(networks, part)
             for name, networks in (("actor", self.actor), ("critics", self.critics))
@@ -142,7 +142,7 @@ class Agent:
         return {f"replay.{name}": getattr(self.replay, name) for name in names}
 
     def update(self, rng: np.random.Generator, rate_share: float) -> float:
-        """One update on a random mini-batch; returns the critics' loss.
+        """Update the networks with a random mini-batch; returns the critics' loss.
 
         `rate_share` is a factor on the learning rates.
         """

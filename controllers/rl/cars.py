@@ -1,7 +1,7 @@
 """The cars of a training in one vector environment, with random roads, cars and sensors.
 
-Each number of a state is an array over N cars. The lateral offset is divided by one half width, as
-in a drive: a controller does not know the width of the road. SI units, track frame.
+A state is an array (N, size) for N cars. As in a drive, the lateral offset is divided by the same
+half width on all roads: a controller does not know the width of the road. SI units, track frame.
 """
 
 from collections.abc import Sequence
@@ -29,21 +29,23 @@ Array = NDArray[np.float32]
 FRICTION, MASS = (0.8, 1.25), (0.85, 1.15)
 """Factors on the friction and the mass of disturbed cars."""
 THROTTLES = (THROTTLE, 0.3)
-"""Throttle of disturbed cars. With less than THROTTLE a car does not climb alpine-2."""
+"""Range of the throttle (0 to 1) of disturbed cars. With less than THROTTLE a car does not climb
+alpine-2."""
 DELAYS = 3
 """The perception of a disturbed car is 0 to DELAYS - 1 steps (of 50 ms) late."""
 PERCEIVED = (0, 1, 4, 5, 6)
 """Indices of the numbers in the paper's state that the perception measures. The car's speeds are
 measured without delay."""
-EPISODE_STEPS = (200, 800)
+EPISODE_STEPS = (200, 800)  # least and greatest number of control steps of an episode
 STANDING = 0.4
 """Share of the cars that start at rest; all other cars start in motion."""
-START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}
-START_SPEED = (0.0, 18.0)
+START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}  # ranges, m and rad
+START_SPEED = (0.0, 18.0)  # range, m/s
 GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
-"""Multiples of the golden ratio modulo 1 are spread evenly for any number of tracks."""
+"""Multiples of the golden ratio modulo 1 are spread evenly for any number of tracks. They decide on
+which tracks the cars are disturbed."""
 RANDOM_START_M = 3000.0
-"""Range of the start on random roads, which differ in length."""
+"""On random roads, which differ in length, the start is 0 to RANDOM_START_M (m) along the road."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Cars:
     """N cars on `tracks` (N names). The cars in the mask `disturbed` (N,) get new random parameters
     in each episode.
 
-    `starts`: options of the reset; `episode`: least and greatest number of steps of an episode.
+    `starts`: fixed values or ranges of the start, for the environment's reset. `episode`: least and
+    greatest number of steps of an episode. `half_width_m`: divisor of the lateral offset.
     """
 
     def __init__(
@@ -148,7 +151,7 @@ class Cars:
         return privileged_state(fleet, throttle, self._delay, self._noise)
 
     def _begin(self, new: NDArray[np.bool_]) -> None:
-        """Draw throttle, delay, noise and length of the episodes of the `new` cars (N,)."""
+        """Set random throttle, delay, noise and length of the episodes of the `new` cars (N,)."""
         low, high = self._episode
         lengths = self._rng.integers(low, high, self.count, endpoint=True)
         throttles = self._rng.uniform(*THROTTLES, self.count)
@@ -161,10 +164,11 @@ class Cars:
         self._noise[new] = np.where(of, noises, 0.0)[new]
 
     def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
-        """The states (N, size); the memory of `new` cars (N,) begins with their present state.
+        """Return the states (N, size) with delay and noise, from the environment's observation.
 
-        If any car is new, only the states of new cars are valid, and the memory of all other cars
-        is unchanged.
+        `new` (N,) marks cars in new episodes: their memory of earlier steps is filled with their
+        present state. If any car is new, only the states of new cars are valid, and the memory of
+        all other cars is unchanged.
         """
         exact = observed.copy()
         exact[:, 0] = info["to_middle"] / self._half_width_m
@@ -204,11 +208,11 @@ def random_cars(
     disturbed: float,
     **options: Any,
 ) -> Cars:
-    """`count` cars that start at random positions and speeds. The cars drive alternately on the
-    next of `tracks` and on random roads; with one track all cars drive on it.
+    """Make `count` cars that start at random positions and speeds.
 
-    `disturbed`: share of the disturbed cars, evenly spread over the tracks. `options`: further
-    options of `Cars`.
+    With several `tracks` every second car drives on a random road; the other cars drive on the
+    tracks in turn. With one track all cars drive on it. `disturbed`: share of the disturbed cars,
+    evenly spread over the tracks. `options`: further arguments of `Cars`.
     """
     several = len(tracks) > 1
     pairs = np.arange(count) // (2 if several else 1)

@@ -1,4 +1,4 @@
-"""The checkpoint of a training: one safetensors file, written between two episodes.
+"""Writes and reads the checkpoint of a training: one safetensors file, written between episodes.
 
 Its tensors are the networks' parameters, Adam's moments and the replay; its metadata is the
 progress as JSON.
@@ -47,7 +47,7 @@ class Learner(Protocol):
     """Networks in training, whose state can be stored and restored."""
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """All arrays and counts that a continued training needs, by name."""
+        """Return all arrays and counts that a continued training needs, by name."""
         ...
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
@@ -63,7 +63,8 @@ def save_checkpoint(run: Path, learner: Learner, progress: Progress) -> None:
 
 
 def load_checkpoint(run: Path, learner: Learner) -> Progress | None:
-    """Restore `learner` from the checkpoint in `run`; returns None without a checkpoint.
+    """Restore `learner` from the checkpoint in the folder `run`; returns the progress, or None
+    without a checkpoint.
 
     Raises UserError for a damaged checkpoint.
     """

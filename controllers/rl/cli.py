@@ -39,9 +39,10 @@ def train(config: TrainConfig, as_json: bool) -> None:
 
 
 def _continued(given: TrainConfig) -> TrainConfig:
-    """The options stored in the folder of the training `given`, with its number of threads.
+    """Return the options stored in the folder `given.out`, with the threads of `given`.
 
-    Raises UserError if other options are given that differ from the stored ones.
+    Raises UserError if any other option of `given` differs from its default and from the stored
+    one.
     """
     from controllers.rl.run_folder import UNCOMPARED, stored_config
 

@@ -11,13 +11,13 @@ from controllers import cli_options as options
 from trackfeatures.errors import UserError
 
 EXPLORATION_STEPS = 400_000
-"""The paper's T_epsilon: the number of steps over which the probability of noise on an action falls
-from EXPLORATION_FIRST to EXPLORATION_LEAST."""
+"""The paper's T_epsilon: the probability of noise on an action falls over this number of control
+steps from EXPLORATION_FIRST to EXPLORATION_LEAST."""
 EXPLORATION_FIRST, EXPLORATION_LEAST = 1.0, 0.1
 QUADRATIC_SCALE = 5.0
 """Factor on `reward_scale` for the quadratic reward, which is about five times smaller."""
 EXPLORATION_NOISE = 0.05
-"""Standard deviation of the paper's noise on an action before the factor beta."""
+"""Standard deviation of the paper's noise on an action in [-1, 1], before the factor beta."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """The settings of `ppo`. Fields without a comment have the names of Schulman et al. 2017."""
+    """The settings of `ppo`. Fields without a text are named as in Schulman et al. 2017."""
 
     discount_length_m: float = 15.0
     """The discount factor of a step is exp(-distance of the step / discount_length_m): 0.94 at
@@ -121,7 +121,7 @@ SETTINGS: dict[str, Algorithm | PpoSettings] = {**ALGORITHMS, PPO: PpoSettings()
 
 
 def _defaults(name: str) -> str:
-    """The value of a setting for each algorithm, for the help of an option."""
+    """Return the value of a setting for each algorithm as text, for the help of an option."""
     return ", ".join(f"{key} {getattr(one, name):g}" for key, one in SETTINGS.items())
 
 
@@ -205,7 +205,7 @@ class TrainConfig:
 
 
 def resolve(config: TrainConfig) -> TrainConfig:
-    """`config` with the defaults that depend on the number of cars."""
+    """Return `config` with the defaults that depend on the number of cars."""
     many = config.vectorised
     defaults: dict[str, Any] = {
         "envs": 256 if many else 1,
@@ -218,7 +218,7 @@ def resolve(config: TrainConfig) -> TrainConfig:
 
 
 def find_settings(config: TrainConfig) -> Algorithm | PpoSettings:
-    """The settings of the algorithm, changed by the options in `config`.
+    """Return the settings of the algorithm, changed by the options in `config`.
 
     Raises UserError for an unknown algorithm and for a learning rate out of range.
     """
@@ -239,6 +239,6 @@ def find_settings(config: TrainConfig) -> Algorithm | PpoSettings:
 
 
 def exploration_share(step: int) -> float:
-    """The paper's epsilon: the probability of noise on the action of `step`."""
+    """Return the paper's epsilon: the probability of noise on the action of control step `step`."""
     fall = EXPLORATION_FIRST - EXPLORATION_LEAST
     return max(EXPLORATION_LEAST, EXPLORATION_FIRST - fall * step / EXPLORATION_STEPS)

@@ -1,4 +1,4 @@
-"""DDPG and TD3 with many cars: the same agent and updates as with one car, on larger batches."""
+"""DDPG and TD3 with many cars: the same agent and updates as with one car, with larger batches."""
 
 from dataclasses import replace
 
@@ -11,13 +11,13 @@ from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import EXPLORATION_NOISE, Algorithm, exploration_share
 
 BATCH = 256
-"""Transitions per update; a transition takes half the time that it takes in a batch of 64."""
+"""Transitions per update. The time per transition is half of the time in a batch of 64."""
 STEPS_PER_UPDATE = 8
 """Control steps per update, summed over all cars."""
 
 
 class OffPolicy:
-    """The learner: `explore` and `learn` are called in turn, once for each step of the cars."""
+    """DDPG or TD3 with N cars: `explore` and `learn` are called in turn, once per control step."""
 
     horizon = 1
 
@@ -29,11 +29,11 @@ class OffPolicy:
         self.divisor, self.odd = self._agent.divisor, algorithm.mirrored
 
     def act(self, states: Array) -> Array:
-        """The actions (N,) of the present actor for states (N, size)."""
+        """Return the actions (N,) of the present actor for states (N, size)."""
         return self._agent.act_all(self._agent.see(states))
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
-        """Actions (N,) with the paper's noise. The probability of noise depends on the step."""
+        """Return actions (N,) with the paper's noise, whose probability falls in the training."""
         agent, count = self._agent, len(states)
         noise = agent.algorithm.beta * EXPLORATION_NOISE * rng.standard_normal(count, np.float32)
         noise *= rng.random(count) < exploration_share(agent.replay.added)
@@ -42,9 +42,10 @@ class OffPolicy:
     def learn(
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
     ) -> dict[str, float]:
-        """Add the transitions of a step and update; returns figures of the updates.
+        """Add the transitions of a step to the replay and update the networks; returns figures of
+        the updates, {} without an update.
 
-        `left`: share of the training that is left.
+        `left`: share of the training that remains, from 1 down to 0.
         """
         agent, of = self._agent, self._agent.algorithm
         rows = zip(
@@ -61,13 +62,13 @@ class OffPolicy:
         return {"loss": float(np.mean(losses)), "reward": float(step.rewards.mean())}
 
     def weights(self) -> dict[str, Array]:
-        """The arrays of the actor as in an actor's file."""
+        """Return the arrays of an actor's file (w1, b1, w2, b2, w3, b3)."""
         return self._agent.weights()
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
+        """Return all arrays and counts that a continued training needs, by name."""
         return self._agent.store()
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
-        """Continue from the arrays and counts of a checkpoint."""
+        """Restore the arrays and counts that `store` returned."""
         self._agent.restore(tensors, counts)

@@ -11,8 +11,8 @@ standard deviation that does not depend on the state. Advantages are generalised
   car needs more steps, but not more metres, to return to the middle of the road.
 - Advantages are divided by their typical size in the state, which the critic's second output
   learns: at the start, where the car is slow, they are small but cost most of the score. Then they
-  are divided by their mean distance from their mean, not by their standard deviation, and limited
-  to 4 times it: an end costs hundreds of times as much as a usual step, and would hide all others.
+  are divided by their mean absolute deviation, not by their standard deviation, and limited to 4
+  times it: an early end costs hundreds of times as much as a usual step, and would hide all others.
 - The critic also receives the exact state and the road ahead (`privileged`).
 - The standard deviation is at least LEAST_STD.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
@@ -46,35 +46,37 @@ SIZE_FLOOR, SIZE_WEIGHT = 0.01, 0.1
 weight of the logarithm's loss beside the value's loss."""
 ADVANTAGE_LIMIT = 4.0
 V_X_AT = privileged.PARTS.index("v_x") - privileged.SIZE
-"""Index of v_x, counted from the end, in a state that is followed by its privileged state."""
+"""Index of v_x of the privileged state, from the end of a state joined with its privileged state.
+"""
 LEAST_STD = 0.05
-"""Least standard deviation of the steering actions; a learned one falls to 0.02 within 1.5 million
-steps, and the score stands still from then on."""
+"""Least standard deviation of the steering actions. Without this limit it falls to 0.02 within 1.5
+million steps, and the score does not improve any more."""
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 def scaled(advantages: Tensor) -> Tensor:
-    """`advantages` (B,) over their mean distance from their mean, limited to ADVANTAGE_LIMIT."""
+    """Return `advantages` (B,) minus their mean, divided by their mean absolute deviation and
+    clipped to +-ADVANTAGE_LIMIT."""
     centred = advantages - advantages.mean()
     return (centred / (centred.abs().mean() + 1e-8)).clamp(-ADVANTAGE_LIMIT, ADVANTAGE_LIMIT)
 
 
 def clipped_loss(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
-    """-mean min(r A, clip(r, 1 - clip, 1 + clip) A) with r = exp(log_ratio); inputs (B,)."""
+    """PPO's loss -mean min(r A, clip(r, 1 - clip, 1 + clip) A), r = exp(log_ratio); inputs (B,)."""
     ratio = log_ratio.exp()
     limited = ratio.clamp(1.0 - clip, 1.0 + clip)
     return -torch.min(ratio * advantages, limited * advantages).mean()
 
 
 def log_density(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
-    """Logarithm of the normal density of `actions` (B,)."""
+    """Return the logarithms (B,) of the normal densities of `actions` (B,) around `means` (B,)."""
     z = (actions - means) * torch.exp(-log_std)
     return -0.5 * z * z - log_std - LOG_SQRT_2PI
 
 
 class Policy(nn.Module):
-    """The actor with its standard deviation, for scaled states (B, size), and the critic, for these
-    and privileged states (B, size + privileged.SIZE)."""
+    """The actor with its standard deviation, and the critic. The actor's input is a scaled state
+    (B, size), the critic's a scaled state with its privileged state (B, size + privileged.SIZE)."""
 
     def __init__(
         self, definition: StateDefinition, settings: PpoSettings, generator: torch.Generator
@@ -88,9 +90,9 @@ class Policy(nn.Module):
         self.log_std = nn.Parameter(torch.tensor(math.log(settings.first_std)))
 
     def mean(self, states: Tensor) -> Tensor:
-        """The mean actions (B,), in (-1, 1)."""
+        """Return the mean actions (B,), in (-1, 1), for scaled states (B, size)."""
         first, second, last = (layer for layer in self.actor if isinstance(layer, nn.Linear))
-        # The same layer for the mirror images of the states is computed beside it.
+        # One product computes the first layer for the states and for their mirror images.
         mirrored = (first.weight * self._signs)[:, self._order]
         weight, bias = torch.cat((first.weight, mirrored)), first.bias.repeat(2)
         hidden = nn.functional.linear(states, weight, bias).relu().view(-1, len(first.bias))
@@ -98,11 +100,11 @@ class Policy(nn.Module):
         return 0.5 * (out[:, 0] - out[:, 1])
 
     def value(self, states: Tensor) -> Tensor:
-        """The values (B,) of scaled states with privileged states."""
+        """Return the values (B,) of scaled states with privileged states."""
         return self.value_and_size(states)[0]
 
     def value_and_size(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """The values (B,) and the logarithms (B,) of the typical size of an advantage."""
+        """Return the values (B,), and the logarithms (B,) of the typical size of an advantage."""
         values, sizes = self.critic(states).unbind(1)
         return values, sizes
 
@@ -114,7 +116,7 @@ def _layers(
     generator: torch.Generator,
     outputs: int = 1,
 ) -> nn.Sequential:
-    """Two hidden layers with ReLU, and the outputs, with orthogonal initial weights."""
+    """Make two hidden layers with ReLU and an output layer, with orthogonal initial weights."""
     widths = (size, *hidden, outputs)
     linears = [nn.Linear(*pair) for pair in pairwise(widths)]
     for linear, factor in zip(linears, (math.sqrt(2.0), math.sqrt(2.0), gain), strict=True):
@@ -126,8 +128,8 @@ def _layers(
 
 @dataclass
 class Rollout:
-    """The last T steps of N cars, (T, N) and, for the scaled states with the privileged states,
-    (T, N, size + privileged.SIZE)."""
+    """The last T steps of N cars. `states` (before a step) and `last` (after it) are scaled states
+    with privileged states (T, N, size + privileged.SIZE); all other arrays are (T, N)."""
 
     states: Array
     last: Array
@@ -145,7 +147,7 @@ class Rollout:
 
 
 class Ppo:
-    """The learner: `explore` and `learn` are called in turn, once for each step of the cars."""
+    """PPO with N cars: `explore` and `learn` are called in turn, once for each control step."""
 
     def __init__(
         self,
@@ -173,23 +175,23 @@ class Ppo:
         self._filled = 0
 
     def act(self, states: Array) -> Array:
-        """The mean actions (N,) for states (N, size)."""
+        """Return the mean actions (N,) for states (N, size)."""
         with torch.no_grad():
             means: Array = self.policy.mean(torch.from_numpy(states / self.divisor)).numpy()
         return means
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
-        """Actions (N,) drawn from the policy; they may exceed [-1, 1]."""
+        """Return random actions (N,) of the policy, which can lie outside [-1, 1]."""
         noise = rng.standard_normal(len(states), np.float32)
         return self.act(states) + noise * np.float32(math.exp(self.policy.log_std.item()))
 
     def learn(
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
     ) -> dict[str, float]:
-        """Add a step of the cars; every `horizon` steps update the networks and return figures of
-        the update.
+        """Add a step of the cars; every `horizon` steps update the networks. Returns figures of the
+        update, {} without an update.
 
-        `left`: share of the training that is left.
+        `left`: share of the training that remains, from 1 down to 0.
         """
         of, row, k = self.settings, self._rollout, self._filled
         row.states[k] = np.hstack((states / self.divisor, step.privileged))
@@ -250,7 +252,7 @@ class Ppo:
         }
 
     def _next_values(self, values: Array) -> Array:
-        """Values (T, N) of the states that the steps led to."""
+        """Return the values (T, N) of the states after the steps, from the `values` before them."""
         row = self._rollout
         found = np.empty_like(values)
         found[:-1] = values[1:]
@@ -260,14 +262,14 @@ class Ppo:
         return found
 
     def _means(self, states: Tensor) -> Tensor:
-        """The mean actions (B,) for states with privileged states."""
+        """Return the mean actions (B,) for scaled states with privileged states."""
         return self.policy.mean(states[:, : len(self.divisor)])
 
     def _improve_actor(
         self, orders: list[Tensor], states: Tensor, targets: Tensor
     ) -> tuple[float, float]:
-        """All epochs of the actor; returns the means of its loss and of its divergence from the
-        policy before the update.
+        """Train the actor for all epochs; returns the means of its loss and of its KL divergence
+        from the policy before the update.
 
         `targets` (B, 3): the action, the logarithm of its density before the update, its advantage.
         """
@@ -285,7 +287,7 @@ class Ppo:
         return mean_loss, mean_kl
 
     def _improve_critic(self, orders: list[Tensor], states: Tensor, wanted: Tensor) -> float:
-        """All epochs of the critic; returns the mean of the loss of its values.
+        """Train the critic for all epochs; returns the mean of the loss of its values.
 
         `wanted` (B, 2): the return, and the logarithm of the size of the advantage.
         """
@@ -304,21 +306,21 @@ class Ppo:
             yield from zip(*parts, strict=True)
 
     def _descend(self, loss: Tensor, adam: torch.optim.Adam) -> None:
-        """One step of the parameters of `adam`, with a limited gradient."""
+        """Change the parameters of `adam` by one step of Adam, with a limited gradient."""
         adam.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(adam.param_groups[0]["params"], self.settings.max_gradient)
         adam.step()
 
     def weights(self) -> dict[str, Array]:
-        """The arrays of the actor as in an actor's file."""
+        """Return the arrays of an actor's file (w1, b1, w2, b2, w3, b3)."""
         linears = [layer for layer in self.policy.actor if isinstance(layer, nn.Linear)]
         w1, w2, w3 = (linear.weight.detach().numpy().T.copy() for linear in linears)
         b1, b2, b3 = (linear.bias.detach().numpy().copy() for linear in linears)
         return dict(zip(NAMES, (w1, b1, w2, b2, w3[:, 0].copy(), b3), strict=True))
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """The arrays and counts of a checkpoint; see `checkpoint.Learner`."""
+        """Return all arrays that a continued training needs, by name; there are no counts."""
         tensors: Tensors = {}
         for name, parameter, moments in self._parameters():
             tensors[f"policy.{name}"] = parameter.detach().numpy()
@@ -327,7 +329,7 @@ class Ppo:
         return tensors, {}
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
-        """Continue from the arrays of a checkpoint."""
+        """Restore the arrays that `store` returned. Raises ValueError for another shape."""
         for name, parameter, moments in self._parameters():
             stored = torch.from_numpy(tensors[f"policy.{name}"])
             if stored.shape != parameter.shape:
@@ -337,7 +339,7 @@ class Ppo:
                 moments[part] = torch.from_numpy(tensors[f"adam.{name}.{part}"].copy())
 
     def _parameters(self) -> Iterator[tuple[str, nn.Parameter, dict[str, Any]]]:
-        """The name, the values and Adam's moments of each parameter."""
+        """Yield the name, the values and Adam's moments of each parameter."""
         for name, parameter in self.policy.named_parameters():
             adam = self._critic_adam if name.startswith("critic.") else self._actor_adam
             yield name, parameter, adam.state[parameter]

@@ -1,8 +1,10 @@
-"""The privileged state: numbers of each car that PPO's critic receives beside the actor's state.
+"""The privileged state: numbers of each car that PPO's critic receives in addition to the actor's
+state.
 
-A critic is needed in a training only, so that it may know more than the actor (an asymmetric
+Only the training needs a critic, so its input can contain more than the actor's (an asymmetric
 actor-critic: Pinto et al. 2018). The actor's state is noisy and late, and does not contain the
-curvature of the road. A critic of this state would blame an action for the bend that follows it.
+curvature of the road. With this state alone a critic would attribute the effect of a bend to the
+action before it.
 """
 
 import numpy as np
@@ -27,14 +29,14 @@ from simulator.world.fleet import (
 )
 
 AHEAD_M = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0)
-"""Distances from the car, along the road, of the curvatures."""
+"""Distances (m) along the road, ahead of the car, at which the state contains the curvature."""
 PARTS = (
     *("d", "angle", "v_x", "v_y", "yaw_rate", "steering", "half_width"),
     *(f"curvature_{ahead:g}" for ahead in AHEAD_M),
     *("friction", "mass", "throttle", "delay", "noise"),
 )
-"""Names of the numbers. Throttle is the difference from the usual one; friction and mass are
-relative differences from the usual car."""
+"""Names of the numbers. Throttle is the difference from THROTTLE; friction and mass are relative
+differences from the car's default parameters."""
 SPREAD = np.array(
     (
         *(0.5, 0.04, 20.0, 0.8, 0.4, 0.3, 5.5),
@@ -43,7 +45,7 @@ SPREAD = np.array(
     ),
     np.float32,
 )
-"""Typical size of each number, by which it is divided."""
+"""Typical size of each number. The number is divided by it."""
 SIZE = len(PARTS)
 FRICTION_AT = PARTS.index("friction")
 _AHEAD = np.array(AHEAD_M)
@@ -55,10 +57,10 @@ def privileged_state(
     delay: NDArray[np.int64],
     noise: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """The privileged states (N, SIZE) of the cars of `fleet`, divided by SPREAD.
+    """Return the privileged states (N, SIZE) of the cars of `fleet`, divided by SPREAD.
 
-    `throttle` in [0, 1], `delay` in control steps, `noise` as a share of its largest standard
-    deviation: arrays (N,).
+    The arguments are arrays (N,): `throttle` in [0, 1], `delay` in control steps, and `noise`, its
+    standard deviation as a share of the largest one.
     """
     found = np.zeros((len(fleet.cars), SIZE), np.float32)
     cars, _, _, tables, _, _, roads, _, _ = fleet.arrays

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 CONFIG, CURVE, TENSORBOARD = "config.json", "curve.csv", "tensorboard"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 UNCOMPARED = ("out", "threads", "resume")
-"""Options that are not compared when a training continues. The folder can have been moved."""
+"""Options that are not compared when a training continues; the folder `out` may have been moved."""
 
 
 def stored_config(run: Path) -> TrainConfig:
-    """The configuration of the training in the folder `run`, to continue it.
+    """Read the configuration of the training in the folder `run`, to continue it.
 
     Raises UserError if the folder has no configuration, or if its file is damaged.
     """
@@ -42,7 +42,8 @@ def stored_config(run: Path) -> TrainConfig:
 
 
 def prepare_folder(config: TrainConfig) -> None:
-    """Make the folder of the run, or check that it contains a run of the same configuration."""
+    """Make the folder of the run, or check that it contains a run of the same configuration; raises
+    UserError otherwise."""
     path = config.out / CONFIG
     if not path.exists():
         config.out.mkdir(parents=True, exist_ok=True)
@@ -63,8 +64,8 @@ def _content(config: TrainConfig) -> dict[str, Any]:
 
 
 def _read(path: Path) -> TrainConfig:
-    """The options in a `config.json`. Options that did not exist at the time of the training get
-    their defaults."""
+    """Read the options in a `config.json`. Options that did not exist at the time of the training
+    get their defaults."""
     try:
         found = dict(json.loads(path.read_text(encoding="utf-8")))
         known = {
@@ -79,7 +80,7 @@ def _read(path: Path) -> TrainConfig:
 
 
 def _open_tensorboard(folder: Path, purge_step: int | None) -> "TensorBoardWriter | None":
-    """A writer of TensorBoard's files; None if the package is not installed."""
+    """Open a writer of TensorBoard's files; None if the package is not installed."""
     if find_spec("tensorboard") is None:
         return None
     from runtime.tensorboard import TensorBoardWriter
@@ -121,7 +122,10 @@ class RunFolder:
             self._tensorboard.add(self.progress.step, named)
 
     def add_evaluation(self, score: float, mean_m: float, max_m: float, actor: Actor) -> None:
-        """Add a point to the curves, keep the `actor` if it is the best, and write a checkpoint."""
+        """Add a point to the curves, save the `actor` if it is the best, and write a checkpoint.
+
+        `score` is the reward per step; `mean_m` and `max_m` are the mean and largest offset.
+        """
         progress = self.progress
         self.tick()
         if score > progress.best_score:
@@ -141,7 +145,7 @@ class RunFolder:
         save_checkpoint(self._run, self._learner, progress)
 
     def result(self) -> dict[str, Any]:
-        """The result of the command."""
+        """Return the figures that `controllers train` prints."""
         progress = self.progress
         return {
             "out": str(self._run),

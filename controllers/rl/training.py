@@ -1,4 +1,4 @@
-"""Training of an actor with one car. The actor with the best drive is kept. SI units.
+"""Trains an actor with one car and keeps the actor with the best drive. SI units.
 
 controllers train --algorithm td3 --track forza --seed 0 --out runs/rl
 
@@ -49,7 +49,8 @@ which is -inf before the first drive."""
 
 
 def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
-    """Train as `config` describes, from the checkpoint of the run if it has one.
+    """Train as `config` describes, from the checkpoint of the run if it has one; returns the
+    figures that `controllers train` prints.
 
     Writes the best actor (by the evaluations), its curves and `config.json` into `config.out`.
     Raises UserError for an unknown name, or a run of another configuration.
@@ -139,13 +140,13 @@ class _Training:
         self._folder.tick()
 
     def _observe(self) -> Observation:
-        """The observation of a controller on the truth, without the noise on the state."""
+        """Return the exact observation of the present step, without the noise on the state."""
         now = self._world.state
         heading = self._world.features().heading
         return Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Options of the reset: {} for the paper's start, or a random position and speed."""
+        """Return options of the reset: {} for the paper's start, or a random position and speed."""
         if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
         return {
@@ -156,7 +157,7 @@ class _Training:
         }
 
     def _explore(self, action: float, rng: np.random.Generator) -> float:
-        """`action` with the paper's noise. The probability of noise depends on the step."""
+        """Return `action` with the paper's noise, whose probability falls during the training."""
         if rng.random() < exploration_share(self._progress.step):
             action += self._algorithm.beta * EXPLORATION_NOISE * rng.standard_normal()
         return min(max(action, -1.0), 1.0)
@@ -174,7 +175,7 @@ class _Training:
         )
 
     def _actor(self, score: float) -> Actor:
-        """The target actor: an average over the last updates, which steers more smoothly."""
+        """Return the target actor: an average over the last updates, which steers more smoothly."""
         agent, algorithm, config = self._agent, self._algorithm, self._config
         assert config.track is not None
         card = ActorCard(
@@ -195,7 +196,7 @@ class _Training:
 
 
 def _drive(actor: Actor, road: Road) -> DriveResult:
-    """The result of the drive that `controllers drive` makes on the truth."""
+    """Drive `actor` on the true state, as `controllers drive` does by default."""
     world = World(road, frequency_hz=FREQUENCY_HZ)
     try:
         world.reset(seed=0)

@@ -16,7 +16,7 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's usual settings
 
 @dataclass(frozen=True)
 class Batch:
-    """B transitions; a transition that ended its episode is followed by no reward."""
+    """B transitions. After a transition that ended its episode, no reward follows."""
 
     states: Array  # (B, state)
     actions: Array  # (B,)
@@ -38,7 +38,7 @@ class Trained:
         self.gradient = layers(self._gradient, shape)
 
     def descend(self, rate: float, number: int) -> None:
-        """Adam's step `number` (from 1) against `gradient` with the learning rate `rate`."""
+        """Change the parameters by Adam's step `number` (from 1) with the learning rate `rate`."""
         first, second = self.moments
         first += (1.0 - BETA_1) * (self._gradient - first)
         second += (1.0 - BETA_2) * (self._gradient * self._gradient - second)
@@ -47,7 +47,7 @@ class Trained:
         self.theta -= (rate / (1.0 - BETA_1**number)) * first / size
 
     def soft_update(self, tau: float) -> None:
-        """target <- tau theta + (1 - tau) target."""
+        """Move the target networks: target <- tau theta + (1 - tau) target."""
         self.target += tau * (self.theta - self.target)
 
 
@@ -57,7 +57,7 @@ def critic_update(
     """Fill the critics' gradients with the gradients of their mean squared error; returns the
     error.
 
-    The target is r + discount min Q'(s', mu'(s') + noise); `noise` is (B,).
+    The target is r + discount min Q'(s', mu'(s') + noise), r after a terminal state; `noise` (B,).
     """
     next_action = np.tanh(forward(actor.target_layers, batch.next_states).out[0])
     next_action = np.clip(next_action + noise, -1.0, 1.0)

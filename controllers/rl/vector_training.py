@@ -1,4 +1,4 @@
-"""Training of an actor with many cars in a vector environment. SI units.
+"""Trains an actor with many cars in a vector environment. SI units.
 
 controllers train --algorithm ppo --envs 256 --out runs/ppo
 
@@ -27,8 +27,7 @@ from simulator.track.catalogue import find_track, list_tracks
 from trackfeatures.errors import UserError
 
 EVALUATION_STEPS = 6500
-"""Steps of an evaluation's drive on each track, from TORCS's first position on the starting
-grid."""
+"""Control steps of an evaluation's drive on each track, from TORCS's first grid position."""
 HALF_WIDTH_M = 5.5
 """Divisor of the offset in a training on all tracks: half the width of forza."""
 Report = Callable[[int, float], None]
@@ -56,7 +55,8 @@ class VectorLearner(Learner, Protocol):
 def train_vector(
     config: TrainConfig, settings: Algorithm | PpoSettings, report: Report | None = None
 ) -> dict[str, Any]:
-    """Train as the resolved `config` describes, from the checkpoint of the run if it has one.
+    """Train as `config`, a result of `resolve`, describes, from the checkpoint of the run if it has
+    one; returns the figures that `controllers train` prints.
 
     Raises UserError for an unknown track, a state that is not supported with several cars, or a run
     of another configuration.
