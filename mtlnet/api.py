@@ -36,32 +36,32 @@ log = logging.getLogger("mtlnet")
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Prediction):
-    """The features of one image; for attributes and units see `Prediction`."""
+    """The track features of one image: the attributes of `Prediction`, and the image's camera."""
 
     source: SourceImage
     """The image in the model's view, with its name and time."""
     camera: CameraParameters
-    """The camera that took the image, at any size of its aspect ratio."""
+    """The camera that took the image. Its size in px can differ from the image's."""
     model_camera: CameraParameters
     """The camera that the model was trained with."""
 
     @property
     def name(self) -> str:
-        """File of the image; `film.mp4#12` for a frame of a film; empty for bytes and pixels."""
+        """The image's file; `film.mp4#12` for frame 12 of a film; empty for bytes and pixels."""
         return self.source.name
 
     @property
     def time_s(self) -> float | None:
-        """Time of the image in s: since 1970 if recorded, else since the start of its film; None:
-        unknown."""
+        """Time of the image in s: since 1970 if it was recorded, else since the start of its film;
+        None if it is unknown."""
         return self.source.time_s
 
     def draw(self, image: OneImage | None = None) -> Image:
-        """A picture of the answer, uint8 RGB.
+        """Draw the features; returns a picture (H, W, 3), uint8 RGB.
 
-        `image`: the image that was answered; the markings are drawn on a copy of it, as straight
-        lines on a flat road. None: the image in the model's view, with the markings, a view from
-        above and the features as text.
+        `image`: the image that was predicted; the markings are drawn on a copy of it, as straight
+        lines on a flat road. None: draws the image in the model's view, with the markings, a view
+        from above and the features as text.
         """
         if image is None:
             return draw_prediction(self.source, self, self.model_camera)
@@ -75,7 +75,7 @@ class Features(Prediction):
 
 
 class Options(TypedDict, total=False):
-    """The options of `Model.predict`; see there."""
+    """The keyword arguments of `Model.predict`."""
 
     camera: str | Path | CameraParameters | None
     fov_y_deg: float | None
@@ -95,7 +95,7 @@ class Model:
 
     @property
     def card(self) -> ModelCard:
-        """Card of the model: network, camera, training data, hashes."""
+        """The model card: network, camera, training data, hashes of the files."""
         return self._engine.card
 
     @property
@@ -120,19 +120,19 @@ class Model:
         fov_y_deg: float | None = None,
         topic: str = "",
     ) -> Any:
-        """The features of one image, of a list of images, or of all images of a source.
+        """Predict the features of one image, of a list of images, or of all images of a source.
 
         `source`: an image file, the bytes of one or pixels (H, W, 3) uint8 RGB give `Features`; a
         list of these gives a list. A film, folder, pattern, recorded round, ROS 2 bag, webcam
         number or address of a stream (all as text, as for `mtlnet predict`) gives an iterator,
-        which reads and answers image by image. `camera`: a camera file or CameraParameters;
+        which reads and predicts image by image. `camera`: a camera file or CameraParameters;
         "model": the model's own; None: the model's own, with the mount of a film's camera estimated
         from the film. `fov_y_deg`: vertical field of view of the images, if nothing else is known
-        about their camera. `topic`: topic of a recording that holds the pictures.
+        about their camera. `topic`: topic with the pictures of a recording.
 
         Raises UserError for a source that cannot be used (ImageError for one image). An iterator
-        raises it after the last image, if any image could not be used. Notes on what was found or
-        left out go to the logger `mtlnet`.
+        raises it after the last image, if any image could not be used. Messages about the sources
+        found, and about skipped ones, go to the logger `mtlnet`.
         """
         lens = self._lens(camera, fov_y_deg)
         if isinstance(source, str | Path):
@@ -195,7 +195,7 @@ class Model:
         copies: str = "",
         page: str | Path | None = None,
     ) -> dict[str, Any]:
-        """The errors on a dataset, as `mtlnet evaluate --json` prints them, in m and rad.
+        """Return the errors on a dataset, as `mtlnet evaluate --json` prints them, in m and rad.
 
         `data`: a folder of recorded rounds, or of pictures with a `labels.csv`. `split`: train,
         test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" adds copies of
@@ -216,13 +216,12 @@ class Model:
         out: str | Path | None = None,
         frames: int = 64,
     ) -> dict[str, Any]:
-        """Write the model as "onnx" or "openvino", in "f32", "bf16" or "int8", as `mtlnet export`
-        does.
+        """Write the model in another format and compare it with torch, as `mtlnet export` does.
 
-        `data`: the dataset whose frames check the result; None: the training data. `out`: the
-        folder to write; None: a folder in `export/` of the model's folder. Returns the result of
-        `mtlnet export --json`. Raises UserError for an unsupported export, ModelError when the
-        result differs from torch.
+        `form`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". `data`: the dataset
+        whose frames are compared, `frames` of them; None: the training data. `out`: the folder to
+        write; None: a folder in `export/` of the model's folder. Returns the result of `mtlnet
+        export --json`. Raises UserError for an unsupported export, ModelError for a difference.
         """
         from mtlnet.export.convert import export_model
 
@@ -237,7 +236,7 @@ def load(
     precision: str | None = None,
     threads: int = 1,
 ) -> Model:
-    """Load a model, ready to answer.
+    """Load a model for prediction.
 
     `model`: a shipped model ("default", or "varied" for real roads and lanes of 2.8 to 4.3 m), the
     name of a run in `runs/`, or the folder of a run.
@@ -250,7 +249,7 @@ def load(
 
 
 def _pixels(image: OneImage) -> Image:
-    """Pixels (H, W, 3) uint8 RGB of one image. Raises ImageError or UserError."""
+    """Return the pixels (H, W, 3) uint8 RGB of one image. Raises ImageError or UserError."""
     if isinstance(image, bytes):
         return decode_file(image)
     if isinstance(image, str | Path):
@@ -264,7 +263,7 @@ def _pixels(image: OneImage) -> Image:
 
 
 def _camera(item: SourceImage, lens: Lens, model: CameraParameters) -> CameraParameters:
-    """The camera that took an image."""
+    """Return the camera that took an image: the image's own, or `model` with the given lens."""
     if item.lens is not None:
         return item.lens.source
     return replace(model, fov_y_deg=lens) if isinstance(lens, float | int) else model

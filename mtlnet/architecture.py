@@ -1,4 +1,4 @@
-"""Architectures of the networks, layer by layer; free of torch.
+"""Architectures of the networks, layer by layer. This module does not import torch.
 
 `mtl`: the paper's network (section IV-C), with TensorFlow's SAME padding.
 
@@ -17,8 +17,9 @@ the grid and the curvature ahead from the shared features (`mtlnet.model.auxilia
 `grid_residual`: `grid` with six additional residual convolutions, for long trainings; it can start
 from a trained `grid` (`mtlnet.model.pretrained`).
 
-`mobilenet_v3_small`, `regnet_y_400mf`: small modern backbones of torchvision with random initial
-weights, for comparison: their pooled features, one layer of 256 units, the same nine outputs.
+`mobilenet_v3_small`, `regnet_y_400mf`: for comparison, small modern backbones of torchvision with
+random initial weights. One layer of 256 units follows their pooled features; the nine outputs are
+those of `mtl`.
 """
 
 from dataclasses import dataclass, replace
@@ -30,10 +31,10 @@ HEIGHT, WIDTH = 210, 280
 
 @dataclass(frozen=True)
 class Conv:
-    """Conv(n, k, s) of the paper: n filters of k x k, stride s, then ReLU; `pad` None: SAME
-    padding.
+    """A convolution and ReLU, the paper's Conv(n, k, s): n filters of k x k, stride s.
 
-    `skip`: the input is added to the output (a residual connection, He et al. 2015).
+    `pad`: zeros at each side, None for SAME padding. `skip`: the input is added to the output (a
+    residual connection, He et al. 2015).
     """
 
     filters: int
@@ -46,7 +47,8 @@ class Conv:
 
 @dataclass(frozen=True)
 class Pool:
-    """MaxPool(k, s), with SAME padding as in the paper, or as in Caffe, which rounds sizes up."""
+    """MaxPool(k, s). `same`: SAME padding, as in the paper; False: no padding, and the output's
+    size is rounded up, as in Caffe."""
 
     kernel: int = 3
     stride: int = 2
@@ -100,8 +102,8 @@ class Architecture:
 
     @property
     def uncertainty_inputs(self) -> int:
-        """Number of inputs of the uncertainty head: features and, with heads over bins, six
-        spreads."""
+        """Number of inputs of the uncertainty head: the last shared features and, with heads over
+        bins, the spreads of the six distributions."""
         return self.shared[-1] + (6 if self.bins else 0)
 
     @property
@@ -126,16 +128,18 @@ HEADS = (("distance", 5), ("angle", 1), ("heading", 3))
 DISTANCE_BINS, ANGLE_BINS = 70, 100
 """Number of bins of a distance (besides one for "absent") and of the angle."""
 NEAR = 4
-"""The answer is the expectation over the bins within this distance of the likeliest bin."""
+"""Number of bins to each side of the likeliest bin; the answer is the expectation over these bins.
+"""
 BIN_VARIANCE = 1 / 12
-"""Variance of a uniform distribution over one bin."""
+"""Variance of a uniform distribution over one bin, in squared bins."""
 PAIR = slice(0, 2)
-"""`ml` and `mr`, which are present or absent together: the two sides of the car's lane."""
+"""Indices of `ml` and `mr`, the two sides of the car's lane, which are present or absent together.
+"""
 ABSENT_ABOVE = (0.54, 0.54, 0.75, 0.54, 0.75)
 """Probabilities above which `ml`, `mr`, `l`, `m` and `r` are answered as absent, chosen on held-out
 frames (docs/experiments/uncertainty.md). A wrongly absent marking counts as an error of 4 to 5 m,
 and `l` and `r` are absent in 70 % of the frames. With 0.5 their mean error is larger by half; with
-0.9 a model of few steps answers the offset from the lane's centre worse."""
+0.9 a briefly trained model has a larger error of the offset from the lane's centre."""
 BIN_HEADS = (("distance", 5 * (DISTANCE_BINS + 1)), ("angle", ANGLE_BINS), ("heading", 3))
 ALEXNET: tuple[Layer, ...] = (
     Conv(96, 11, 4, pad=0),
@@ -186,11 +190,11 @@ ARCHITECTURES |= {
     for base in list(ARCHITECTURES.values())
     for kind in HEAD_KINDS
     if base.bins != (kind == "bins")
-}  # each with the other heads: `mtl-bins`, ..., `grid-coded`
+}  # each network also with the other kind of heads: `mtl-bins`, ..., `grid-coded`
 
 
 def find_architecture(name: str) -> Architecture:
-    """The architecture with this name. Raises UserError for an unknown name."""
+    """Return the architecture called `name`. Raises UserError for an unknown name."""
     if name not in ARCHITECTURES:
         names = [name for name in ARCHITECTURES if not name.endswith(HEAD_KINDS)]
         raise UserError(f"there is no network {name!r}; choose one of {', '.join(names)}")
@@ -198,7 +202,8 @@ def find_architecture(name: str) -> Architecture:
 
 
 def with_heads(name: str, kind: str) -> str:
-    """Name of network `name` with heads of `kind`, one of `HEAD_KINDS`. Raises UserError."""
+    """Return the name of network `name` with heads of `kind`, one of `HEAD_KINDS`. Raises UserError
+    for an unknown kind or name."""
     if kind not in HEAD_KINDS:
         raise UserError(f"--heads {kind!r} is unknown; give {' or '.join(HEAD_KINDS)}")
     base = name.removesuffix("-bins").removesuffix("-coded")
@@ -215,14 +220,15 @@ def require_task_heads(architecture: Architecture, alpha: tuple[float, float, fl
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
-    """TensorFlow's SAME padding: (output size, zeros before, zeros after)."""
+    """Return the output size, and the numbers of zeros before and after the `size` input values, of
+    TensorFlow's SAME padding."""
     out = -(-size // stride)
     total = max((out - 1) * stride + kernel - size, 0)
     return out, total // 2, total - total // 2
 
 
 def grid_size(architecture: Architecture) -> tuple[int, int, int]:
-    """Channels, rows and columns of the last features."""
+    """Return channels, rows and columns of the last features."""
     channels, height, width = 3, HEIGHT - architecture.first_row, WIDTH
     for spec in architecture.features:
         height, width = output_size(height, spec), output_size(width, spec)
@@ -231,7 +237,7 @@ def grid_size(architecture: Architecture) -> tuple[int, int, int]:
 
 
 def output_size(size: int, layer: Layer) -> int:
-    """Number of output rows (or columns) of a layer for `size` input rows (or columns)."""
+    """Return a layer's number of output rows (or columns) for `size` input rows (or columns)."""
     if isinstance(layer, LocalNorm):
         return size
     if isinstance(layer, Conv) and layer.pad is not None:

@@ -26,7 +26,8 @@ app = typer.Typer(
 )
 SPIN_COUNT = "10000"
 """Number of iterations that OpenMP's threads spin before they sleep and free their core for the
-threads that decode images; with OpenMP's default, 300,000, a step took 1.07 times as long."""
+threads that decode images. With OpenMP's default, 300,000, a training step takes 1.07 times as
+long."""
 MAX_PRINTED = 40
 """Maximum number of rows of the table that `predict` prints."""
 
@@ -105,7 +106,7 @@ def ship_command(
     picture: options.ShippedPicture = None,
     as_json: command.AsJson = False,
 ) -> None:
-    """Write a model in half the bytes: weights in float16, and the graph that `serve` loads.
+    """Write a model at half the size: weights in float16, and the graph that `serve` loads.
 
     With --evaluation: write README.md, with the figures of evaluations, for the model in --out.
     """
@@ -138,8 +139,8 @@ def evaluate_command(
     precision: options.Precision = None,
     as_json: command.AsJson = False,
 ) -> None:
-    """Evaluate a model on a dataset: its errors in m and rad beside the errors of always predicting
-    the training mean."""
+    """Evaluate a model on a dataset: print its errors in m and rad, and the errors of a baseline
+    that always predicts the training mean."""
     from rich.console import Console
 
     from mtlnet.evaluation.evaluate import evaluate
@@ -282,14 +283,14 @@ def label_command(
 
 
 def _print_model(name: str) -> None:
-    """Print the run folder of a model's name on stderr."""
+    """Print the run folder of the model `name` on stderr."""
     from mtlnet.inference.model_card import resolve_run
 
     typer.echo(f"model: {resolve_run(name)}", err=True)
 
 
 def _load(model: str, kind: str, precision: str | None, *, gpu: bool = False) -> "Engine":
-    """The engine of a model, with one thread; `gpu`: the torch engine on a GPU if there is one."""
+    """Load a model's engine, with one thread. `gpu`: the torch engine can use a GPU."""
     from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
     from mtlnet.inference.model_card import resolve_run
 
@@ -299,5 +300,5 @@ def _load(model: str, kind: str, precision: str | None, *, gpu: bool = False) ->
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command `mtlnet`."""
     command.main(app)

@@ -22,7 +22,7 @@ Precision = Annotated[
     str | None,
     typer.Option(
         help="Precision of the engine: int8 (after `mtlnet export`), bf16 or f32.",
-        show_default="int8 once it passed its gate, else bf16 where the CPU supports it, else f32",
+        show_default="int8 if it passed its accuracy gate, else bf16 if the CPU has it, else f32",
     ),
 ]
 
@@ -76,7 +76,7 @@ ExportOut = Annotated[
 ]
 CheckFrames = Annotated[
     int,
-    typer.Option(help="Number of frames on which the export is compared with torch, to 10,000."),
+    typer.Option(help="Number of frames on which the export is compared with torch, 1 to 10,000."),
 ]
 
 # Options of `ship`.
@@ -174,7 +174,7 @@ PredictCamera = Annotated[
     Path | None,
     typer.Option(
         help="Camera file (YAML) of the pictures, or `model` for the model's camera.",
-        show_default="that of a recording, or estimated from a film or stream; else the model's",
+        show_default="a recording's own; estimated from a film or stream; else the model's",
     ),
 ]
 Topic = Annotated[
@@ -208,7 +208,8 @@ NoModel = Annotated[
 LabelHost = Annotated[
     str,
     typer.Option(
-        "--host", help="Address to listen on; one that other machines reach requires a token."
+        "--host",
+        help="Address to listen on. An address that other machines can reach requires a token.",
     ),
 ]
 LabelPort = Annotated[
@@ -224,7 +225,9 @@ LabelToken = Annotated[
 ]
 LabelInsecure = Annotated[
     bool,
-    typer.Option("--insecure", help="Allow a --host that other machines reach without a token."),
+    typer.Option(
+        "--insecure", help="Require no token, even on a --host that other machines can reach."
+    ),
 ]
 ImportTable = Annotated[
     Path | None,

@@ -32,7 +32,8 @@ EXPORT_CHECK_FRAMES = 16
 
 
 def start_training(options: Mapping[str, Any], out: Path | None, *, resume: bool) -> dict[str, Any]:
-    """Train; returns the result of `mtlnet train --json`, or {} in all but the first process.
+    """Start or resume a training; returns the result of `mtlnet train --json`, or {} in all but the
+    first process of a distributed training.
 
     `options`: the fields of TrainConfig that were given, and `heads`. Raises UserError.
     """
@@ -116,8 +117,12 @@ def train(
     *,
     checked: bool = False,
 ) -> ModelCard:
-    """Train a network with the settings of `config` and publish the model in `config.out`. The
-    arguments are the same as those of `run_training`."""
+    """Train a network with the settings of `config` and publish the model in `config.out`; returns
+    its card.
+
+    `resumed`: the stored description of the data of the run to resume; None starts a new run.
+    `checked`: all images are known to be decodable.
+    """
     run_training(config, resumed, finish, report, checked=checked)
     return read_card(config.out)
 

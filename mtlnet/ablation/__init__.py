@@ -1,1 +1,1 @@
-"""`mtlnet ablate`: the paper's ablation table."""
+"""`mtlnet ablate`: trains and evaluates the networks of the paper's ablation table."""

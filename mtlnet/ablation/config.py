@@ -12,7 +12,7 @@ from trackfeatures.errors import UserError
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds from "1,2,3". Raises UserError when one is not a non-negative integer."""
+    """Parse seeds such as "1,2,3". Raises UserError when one is not a non-negative integer."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdigit() for part in parts):
         raise UserError(f"--seeds {text!r} is not a list of whole numbers; give them as 1,2,3")
@@ -21,7 +21,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class AblationConfig:
-    """One ablation. Only `seeds`, `device` and `threads` may change when it is continued."""
+    """One ablation. Only `seeds`, `device` and `threads` can change when it is continued."""
 
     out: Annotated[Path, Option(help="Folder of the ablation; an existing one is continued.")]
     iterations: Annotated[int, Option(help="Number of training steps of every run.")]
@@ -49,6 +49,6 @@ class AblationConfig:
             raise UserError(f"--seeds {self.seeds} must be different numbers, at least one")
 
     def shared_settings(self) -> dict[str, Any]:
-        """The settings that must be equal for runs to be comparable."""
+        """Return, by name, the settings that must be equal for runs to be comparable."""
         same = ("iterations", "recipe", "batch", "split", "every")
         return {"definitions": tf.VERSION, **{name: getattr(self, name) for name in same}}

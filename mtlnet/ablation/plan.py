@@ -32,13 +32,14 @@ from trackfeatures.errors import UserError
 SETTINGS, EVALUATION = "settings.json", "evaluation.json"
 BACKBONE = "mobilenet_v3_small"
 TASK_NAMES = ("distance", "angle", "type")
-"""Names of the tasks in the paper, the rows and the columns of `curves.csv`; `type` is the
-class."""
+"""Names of the tasks in the paper, in `PAPER_ROWS` and in the columns of `curves.csv`; the task
+`type` is the class of the road."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table; `paper`: the paper's distance loss, angle loss and accuracy."""
+    """One row of the table: a network with task weights. `paper`: the paper's distance loss, angle
+    loss and accuracy of the class; None where the paper has none."""
 
     name: str
     title: str
@@ -60,7 +61,7 @@ PAPER_ROWS = (
 
 
 def ablation_rows(backbone: str = BACKBONE, only: str = "") -> tuple[Row, ...]:
-    """The paper's seven rows, DeepDriving and `backbone`, or only the rows named in `only`.
+    """Return the paper's seven rows, DeepDriving and `backbone`, or only those named in `only`.
 
     `only`: names separated by commas; empty: all rows. Raises UserError for an unknown name, and
     when `backbone` is not a torchvision backbone.
@@ -82,7 +83,7 @@ def ablation_rows(backbone: str = BACKBONE, only: str = "") -> tuple[Row, ...]:
 
 @dataclass(frozen=True)
 class Run:
-    """One row with one seed, and the folder of its run."""
+    """The training of one row with one seed, and the folder of its run."""
 
     row: Row
     seed: int
@@ -101,7 +102,7 @@ Evaluate = Callable[[Path, AblationConfig], dict[str, Any]]
 
 
 def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
-    """All runs, ordered by seed, so that the table is complete as early as possible."""
+    """Return all runs, ordered by seed, so that the table is complete after the first seed."""
     return [
         Run(row, seed, config.out / "runs" / f"{row.name}-seed{seed}")
         for seed in config.seeds
@@ -110,7 +111,8 @@ def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
 
 
 def require_same_settings(config: AblationConfig, content_hash: str) -> None:
-    """Write the settings of a new folder. Raises UserError when the folder has other settings."""
+    """Write the settings of a new folder. Raises UserError when the folder has other settings, or
+    other files. `content_hash` is the hash of the dataset."""
     settings = {**config.shared_settings(), "content_hash": content_hash}
     path = config.out / SETTINGS
     if path.is_file():
@@ -136,8 +138,8 @@ def require_same_settings(config: AblationConfig, content_hash: str) -> None:
 def finish_runs(
     config: AblationConfig, runs: Sequence[Run], train: Train, evaluate: Evaluate
 ) -> Iterator[Run]:
-    """Finish the runs one after another and yield each; runs finished before are yielded at
-    once."""
+    """Train and evaluate the unfinished runs one after another. Yields each run when it is
+    finished."""
     for run in runs:
         if run.state != "finished":
             _finish(config, run, train, evaluate)
@@ -173,7 +175,7 @@ def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) 
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """The evaluation of a finished run; None if it is missing or belongs to other weights."""
+    """Read the evaluation of a finished run; None if it is missing or belongs to other weights."""
     if not (folder / EVALUATION).is_file() or not (folder / CARD).is_file():
         return None
     try:
@@ -188,9 +190,9 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table. `task`: index, in the task weights alpha, of the measured task.
+    """A column of the table. `task`: index of the measured task in the task weights alpha.
 
-    `path`: keys of the figure in an evaluation.
+    `path`: the keys that lead to the value in an evaluation; `scale`: factor for the page.
     """
 
     name: str
@@ -217,15 +219,16 @@ MAX_CURVE_POINTS = 120
 
 
 def figures(result: Any) -> dict[str, float | None]:
-    """Value of each of `COLUMNS` in one evaluation."""
+    """Return the value of each of `COLUMNS` in the evaluation `result`, by the column's name."""
     return {column.name: reduce(getitem, column.path, result) for column in COLUMNS}
 
 
 def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """One entry per row: {"row", "seeds", "figures": {column: {"mean", "std", "values"} or None}}.
+    """Return an entry for each row: {"row", "seeds", "frames", "figures"}.
 
-    A column is None where the row did not learn that task. `std` is the sample standard deviation
-    over the seeds; None for a single seed.
+    "figures" is {column: {"mean", "std", "values"} or None}; None where the row did not learn the
+    column's task. "std" is the sample standard deviation over the seeds; None for a single seed.
+    "frames" is the number of evaluated frames.
     """
     entries = []
     for row in rows:
@@ -249,7 +252,7 @@ def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
-    """Index of the entry with the best mean in a column; None when no entry has one."""
+    """Return the index of the entry with the best mean in a column; None without any mean."""
     found = [(entry["figures"][column], i) for i, entry in enumerate(entries)]
     means = [(figure["mean"], i) for figure, i in found if figure is not None]
     return (max if column == "accuracy" else min)(means, default=(None, None))[1]
@@ -258,7 +261,7 @@ def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
 def training_curve(
     runs: Sequence[Run], row: Row, task: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Steps (P,) and training losses (seeds, P) of a task; None without a finished run.
+    """Return steps (P,) and training losses (seeds, P) of a task; None without a finished run.
 
     Each point is the mean over an equal share of the logged points, which smooths the curve.
     """

@@ -55,7 +55,7 @@ REPORT_SECONDS = 30.0
 
 
 def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False) -> dict[str, Any]:
-    """Run an ablation, or only plan it with `dry_run`; returns what `mtlnet ablate --json` prints.
+    """Run an ablation, or only plan it with `dry_run`; returns the result that `--json` prints.
 
     Raises UserError when the folder contains an ablation with other settings, or when a run fails.
     """
@@ -88,7 +88,7 @@ def write_result(config: AblationConfig, rows: Sequence[Row], runs: list[Run]) -
 
 
 def _train_with_messages(console: Console) -> Train:
-    """`train` with a message every `REPORT_SECONDS`."""
+    """Return a function that trains a run and prints a message every `REPORT_SECONDS`."""
 
     def train_run(config: TrainConfig, resumed: dict[str, Any] | None) -> None:
         printed = time.perf_counter()
@@ -112,7 +112,7 @@ def _train_with_messages(console: Console) -> Train:
 
 
 def _evaluate_run(run: Path, config: AblationConfig) -> dict[str, Any]:
-    """Evaluation of a finished run, in float32."""
+    """Evaluate a finished run in float32 on the split `config.split`."""
     engines = [load_engine(run, "openvino", "f32") for _ in range(os.cpu_count() or 1)]
     return evaluate(engines, config.data, config.split, every=config.every)
 
@@ -120,7 +120,7 @@ def _evaluate_run(run: Path, config: AblationConfig) -> dict[str, Any]:
 def _plan_with_times(
     config: AblationConfig, runs: Sequence[Run], dataset: Dataset, console: Console
 ) -> dict[str, Any]:
-    """The runs, each with the seconds of training that remain."""
+    """Print and return the plan: the runs, each with the seconds of training that remain."""
     seconds = {
         name: step_seconds(config, name, runs, dataset)
         for name in dict.fromkeys(run.row.network for run in runs)
@@ -148,7 +148,8 @@ def _plan_with_times(
 def step_seconds(
     config: AblationConfig, network: str, runs: Sequence[Run], dataset: Dataset
 ) -> float:
-    """Median seconds per step, from finished runs of the network or from a few steps taken now."""
+    """Return the median seconds per training step, from the finished runs of the network; without
+    one, from `TIMED_STEPS` steps made now."""
     speeds = [
         point["images_per_second"]
         for run in runs
@@ -178,7 +179,7 @@ def step_seconds(
 COLOURS = ("#3b6fd4", "#e07a2e", "#2a9d5c", "#c23b6b")
 SINGLE_TASK_COLOUR = "#6a3fb5"  # the paper's purple line
 FINAL_SHARE = 0.05
-"""Share of a run, at its end, over which its final loss is averaged."""
+"""The final loss of a run is the mean over this share of its steps, the last ones."""
 PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
 """Columns after which the page shows the paper's figures, and their numbers of decimal places. The
 paper does not define its losses exactly."""
@@ -187,8 +188,8 @@ paper does not define its losses exactly."""
 def page(
     config: AblationConfig, entries: Sequence[dict[str, Any]], rows: Sequence[Row], runs: list[Run]
 ) -> str:
-    """HTML page with our losses beside the paper's, the errors in metres and radians, and training
-    curves."""
+    """Return the HTML page: our losses and the paper's, the errors in metres and radians, and the
+    training curves."""
     return render(
         "mtlnet.ablation",
         "ablation.html",
@@ -220,7 +221,8 @@ def _alpha_text(alpha: Sequence[float]) -> str:
 
 
 def _training_chart(task: int, rows: Sequence[Row], runs: Sequence[Run]) -> Markup:
-    """Training loss of one task: MTL 1 to 4, and the final loss of the task learned alone."""
+    """Draw the training loss of one task (an index of `TASK_NAMES`): curves of MTL 1 to 4, and a
+    line at the final loss of the network that learned this task alone."""
     name = TASK_NAMES[task]
     multi_task = [row for row in rows if row.network == "mtl" and sum(a > 0 for a in row.alpha) > 1]
     lines, last_step = [], 1.0
@@ -240,7 +242,7 @@ def _training_chart(task: int, rows: Sequence[Row], runs: Sequence[Run]) -> Mark
 
 
 def _final_loss_line(losses: NDArray[np.float64], last_step: float, label: str) -> Line:
-    """A horizontal line at the mean of the last part of losses (seeds, P)."""
+    """Return a horizontal line at the mean of the last `FINAL_SHARE` of `losses` (seeds, P)."""
     count = max(1, round(FINAL_SHARE * losses.shape[1]))
     level = np.full(2, losses[:, -count:].mean())
     return Line("level", np.array([0.0, last_step]), level, label, SINGLE_TASK_COLOUR)

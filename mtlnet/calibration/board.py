@@ -23,16 +23,16 @@ SMALLEST = (3, 3)
 DICTIONARY, MARKER = "4X4_50", 0.75
 MIN_PICTURES = 3
 FEW = 8
-"""Number of pictures below which the third radial coefficient stays 0, because it would fit the
-noise."""
+"""With fewer pictures than this the third radial coefficient of the lens stays 0, because it would
+fit the noise."""
 MIN_CHARUCO = 8
 OUTLIER = 4.0
-"""A picture is left out if its error exceeds this multiple of the median error, and 1 px."""
+"""A picture is left out if its error exceeds both this multiple of the median error and 1 px."""
 Picture = NDArray[np.uint8]
 Corners = NDArray[np.float32]
 Finder = Callable[[Picture], tuple[Corners, Corners] | None]
-"""Returns the corners on the board (N, 3) and in a grayscale picture (N, 2); None where the picture
-shows no board."""
+"""A function that returns the corners on the board (N, 3) and in a grayscale picture (N, 2); None
+where the picture shows no board."""
 
 
 class NoBoard(UserError):
@@ -41,8 +41,8 @@ class NoBoard(UserError):
 
 @dataclass(frozen=True)
 class BoardPicture:
-    """A picture with its corners (N, 2) px, their projections, and the root mean square error; a
-    picture that is not used has a `problem` instead."""
+    """A picture with its corners found (N, 2) px, their projections by the calibrated lens (N, 2)
+    px, and the root mean square error. A picture that is not used has a `problem` instead."""
 
     path: Path
     corners: NDArray[np.float64]
@@ -53,8 +53,8 @@ class BoardPicture:
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """The calibrated lens; `focal_std_px` is the standard deviation of fy, `error_px` the error
-    over all used corners."""
+    """The calibrated lens. `focal_std_px` is the standard deviation of the focal length fy,
+    `error_px` the root mean square error over all used corners."""
 
     camera: CameraParameters
     board: str
@@ -71,7 +71,7 @@ class BoardCalibration:
 def calibrate_board(
     paths: Sequence[Path], board: str, model: CameraParameters, fisheye: bool = False
 ) -> BoardCalibration:
-    """The lens of the camera that took `paths`, which all show one board.
+    """Calibrate the lens of the camera that took the pictures `paths`, which show one board.
 
     `board`: inner corners of a chessboard, such as "9x6"; "charuco:5x7" for the squares of a
     ChArUco board, optionally followed by ":DICTIONARY:MARKER", the ArUco dictionary and the side of
@@ -128,7 +128,7 @@ def _read(path: Path) -> tuple[Picture | None, str]:
 def _find(
     pictures: Sequence[tuple[Path, Picture | None, str]], board: str
 ) -> tuple[str, dict[Path, tuple[Corners, Corners]], tuple[int, int]]:
-    """Name of the board, corners by picture, and size of the pictures."""
+    """Return the name of the board, the corners by picture, and the size of the pictures."""
     greys = {path: grey for path, grey, _ in pictures if grey is not None}
     if not greys:
         raise NoBoard(f"none of {len(pictures)} pictures can be read: {pictures[0][2]}")
@@ -141,7 +141,8 @@ def _find(
 
 
 def _recognised(greys: Sequence[Picture]) -> str:
-    """The chessboard that most pictures show; a part of it may be hidden in some pictures."""
+    """Return the size, such as "9x6", of the chessboard found in most pictures; some pictures can
+    show only a part of it. Raises NoBoard."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     counts: Counter[tuple[int, int]] = Counter()
     for grey in greys:
@@ -187,7 +188,8 @@ def _finder(board: str) -> Finder:
 
 
 def _chessboard(grey: Picture, shape: tuple[int, int]) -> tuple[Corners, Corners] | None:
-    """Corners by OpenCV's detector of sectors (Duda and Frese 2018), with subpixel accuracy."""
+    """Find the corners of a chessboard on the board (N, 3) and in the picture (N, 2), by OpenCV's
+    sector-based detector (Duda and Frese 2018); None without a board."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     seen, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not seen:
@@ -221,7 +223,7 @@ class _Solved:
 def _solve(
     found: dict[Path, tuple[Corners, Corners]], size: tuple[int, int], fisheye: bool
 ) -> _Solved:
-    """OpenCV's least squares over all corners. Raises NoBoard where it finds no lens."""
+    """Fit the lens to all corners by OpenCV's least squares. Raises NoBoard if it finds no lens."""
     solve, project = _fisheye if fisheye else _usual, _projection(fisheye)
     try:
         error, matrix, bent, turns, moves, focal_std = solve(list(found.values()), size)
@@ -246,8 +248,8 @@ def _projection(fisheye: bool) -> Callable[..., Any]:
 
 
 def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """Error in px, camera matrix, coefficients, rotations and translations of the boards, and
-    standard deviation of fy."""
+    """Fit a usual lens; returns error in px, camera matrix, coefficients, rotations and
+    translations of the boards, and standard deviation of fy in px."""
     flags = cv2.CALIB_FIX_K3 if len(pairs) < FEW else 0
     boards, corners = ([pair[k] for pair in pairs] for k in range(2))
     *found, deviations, _, _ = cv2.calibrateCameraExtended(
@@ -257,7 +259,8 @@ def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
 
 
 def _fisheye(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """As `_usual`, for a fisheye lens. OpenCV gives no deviations, so the deviation of fy is 0."""
+    """Fit a fisheye lens; returns the same values as `_usual`, but 0 for the standard deviation of
+    fy, which OpenCV does not compute."""
     names: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, 5
     found = cv2.fisheye.calibrate(
         [board.reshape(1, -1, 3).astype(np.float64) for board, _ in pairs],

@@ -1,4 +1,5 @@
-"""`mtlnet calibrate drive.mp4`: the camera of a film, or of consecutive pictures of a drive."""
+"""`mtlnet calibrate drive.mp4`: estimates the camera of a film or of consecutive pictures of a
+drive."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,21 +21,23 @@ LONGEST_S = 120.0
 """Maximum duration of a film that is read, s."""
 DEFAULT_FPS = 25.0
 PICTURE_S = 1.0
-"""Time between consecutive pictures with unknown times, s: too long to follow points."""
+"""Assumed time (s) between consecutive pictures, whose times are unknown. It is too long to follow
+points from one picture to the next."""
 SHOWN = 6
 """Number of pictures kept for the page."""
 
 Picture = NDArray[np.uint8]
 MakeLens = Callable[[tuple[int, int]], KnownLens]
-"""Returns the lens of pictures of this size (width, height)."""
+"""A function that returns the lens of pictures of a size (width, height)."""
 Report = Callable[[float, float], None]
-"""Takes the seconds done and the total."""
+"""A function that is called with the part done and the whole: s of a film, or numbers of pictures.
+"""
 
 
 @dataclass(frozen=True)
 class CalibratedDrive:
-    """The estimate, some of the pictures, and a text about the film's fault (empty if it has
-    none)."""
+    """The estimated camera, some of the pictures, and a text about damage of the film (empty if
+    there is none)."""
 
     found: DriveEstimate
     shown: list[Picture]
@@ -48,8 +51,8 @@ def calibrate_film(
     report: Report = lambda done, total: None,
     longest_s: float = LONGEST_S,
 ) -> CalibratedDrive:
-    """The camera that filmed `path`, from at most its first two minutes. Raises NotCalibrated, or
-    UserError for a file that is not a film."""
+    """Estimate the camera of the film `path` from at most its first `longest_s` seconds. Raises
+    NotCalibrated, or UserError for a file that is not a film."""
     header = read_film_header(path)
     fps = header.fps or DEFAULT_FPS
     total = min(header.count / fps, longest_s) if header.count else longest_s
@@ -79,7 +82,7 @@ def calibrate_pictures(
     lane_width_m: float | None = None,
     report: Report = lambda done, total: None,
 ) -> CalibratedDrive:
-    """The camera that took these pictures of a drive, in this order. Raises NotCalibrated."""
+    """Estimate the camera of pictures of a drive, in the order of time. Raises NotCalibrated."""
 
     def timed() -> Iterator[tuple[float, Picture]]:
         for number, path in enumerate(paths):

@@ -1,4 +1,4 @@
-"""Estimates a camera's mount from consecutive pictures of a drive, of a film or a stream.
+"""Estimates a camera's mount (height and angles) from the consecutive pictures of a film or stream.
 
 calibration = DriveCalibration(lens)
 for picture, time_s in pictures:
@@ -28,8 +28,8 @@ LANE_WIDTH_M = 3.6
 """Lane width assumed if none is given, m."""
 LANE_WIDTH_STD_M = 0.25
 MAX_STD_DEG = 1.0
-"""Maximum standard deviation of pitch and yaw, degrees, apart from the part that the lens adds. A
-drive with a larger one is refused."""
+"""Maximum standard deviation of pitch and yaw, degrees, without the contribution of the lens. A
+drive with a larger standard deviation is refused."""
 LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
 """Time between the pictures whose markings are used, s."""
@@ -38,8 +38,8 @@ FOLLOW_S = (0.09, 0.25)
 KEPT = 600
 """Maximum number of pictures that are kept; for a stream these are the latest two minutes."""
 FIRST_LOOK = 25
-"""Number of pictures after which the horizon is roughly known; the width of markings in the picture
-depends on it."""
+"""Number of pictures after which the horizon is first estimated; the expected width of markings in
+the picture depends on it."""
 WORKING_WIDTH = 640
 TRACK_NOISE_PX = 0.2
 MOTION_ROUNDS = 2
@@ -47,7 +47,7 @@ MOTION_ROUNDS = 2
 
 @dataclass(frozen=True)
 class DriveEstimate:
-    """The camera, with standard deviations of its mount in degrees and m."""
+    """The estimated camera, with standard deviations of its mount in degrees and m."""
 
     camera: CameraParameters
     pitch_std_deg: float
@@ -61,7 +61,7 @@ class DriveEstimate:
     """Number of pictures that show the lane's markings on straight road."""
 
     def about(self) -> str:
-        """The estimate as one line of text."""
+        """Return the estimate as one line of text."""
         camera = self.camera
         assumed = "given" if self.lane_width_given else "assumed"
         return (
@@ -74,7 +74,7 @@ class DriveEstimate:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """The estimate with its standard deviations, by name and unit."""
+        """Return the estimate with its standard deviations as values for JSON."""
         camera = self.camera
         return {
             "pitch_deg": camera.pitch_deg,
@@ -117,18 +117,18 @@ class DriveCalibration:
 
     @property
     def pictures(self) -> int:
-        """Number of pictures that count so far."""
+        """Number of pictures so far whose markings are used."""
         return len(self._samples)
 
     def add(self, picture: NDArray[np.uint8], time_s: float, *, bgr: bool = False) -> None:
-        """Add a picture (H, W, 3), RGB or BGR, of the lens at any size of its aspect ratio. Most
-        pictures are skipped. Times must increase."""
+        """Add a picture (H, W, 3), RGB or BGR, with the aspect ratio of the lens, taken at `time_s`
+        (s). Times must increase. Most pictures are skipped, because they are too close in time."""
         if time_s >= self._next_s:
             self._next_s = max(self._next_s + SAMPLE_S, time_s + SAMPLE_S / 2)
             small = self._resized(picture, bgr)
             self._samples.append(Sample(time_s, self._lines(small)))
             self._taken += 1
-            # Points are followed from every second one.
+            # Points are followed from every second of these pictures.
             self._before = (time_s, _grey(small)) if self._taken % 2 else None
             if self._taken == FIRST_LOOK:
                 self._look()
@@ -141,7 +141,7 @@ class DriveCalibration:
                     self._tracks.append((begin, time_s - begin, self._normalised_tracks(tracks)))
 
     def estimate(self) -> DriveEstimate:
-        """The camera estimated from the pictures so far. Raises NotCalibrated."""
+        """Estimate the camera from the pictures so far. Raises NotCalibrated."""
         width = self._lane_width_m
         start = find_vanishing_point(sample.lines for sample in self._samples)
         if start is None:
@@ -166,8 +166,8 @@ class DriveCalibration:
         return self._estimate(mount)
 
     def _motions(self, start: tuple[float, float]) -> list[TimedMotion]:
-        """All motions; the search for each direction of travel starts at the direction of most
-        motions."""
+        """Return the camera's motions between followed pictures. The direction of travel of each is
+        searched near `start`, in the second round near the median direction of the first round."""
         noise, towards = TRACK_NOISE_PX / self._view.focal_px, np.array(start)
         motions: list[TimedMotion] = []
         for _ in range(MOTION_ROUNDS):
@@ -178,7 +178,8 @@ class DriveCalibration:
         return motions
 
     def _estimate(self, mount: Mount) -> DriveEstimate:
-        """The estimate for a mount. An error of the focal length scales the angles."""
+        """Return the estimate for a mount. The angles' standard deviations include the error of the
+        focal length, which scales the angles."""
         lens, given = self._lens, self._lane_width_m is not None
         camera = replace(
             lens.camera,
@@ -201,7 +202,7 @@ class DriveCalibration:
         )
 
     def _resized(self, picture: NDArray[np.uint8], bgr: bool) -> NDArray[np.uint8]:
-        """The picture in RGB, at the working size."""
+        """Return the picture in RGB at the working size."""
         size = (self._view.width, self._view.height)
         if picture.shape[1::-1] != size:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
@@ -214,7 +215,8 @@ class DriveCalibration:
             self._horizon_px = float(k[1, 2] + k[1, 1] * found[1])
 
     def _lines(self, picture: NDArray[np.uint8]) -> Lines:
-        """The picture's segments in normalised coordinates, without the lens's distortion."""
+        """Find the markings' segments in a picture; returns them in normalised coordinates, without
+        the lens's distortion."""
         return normalised(find_segments(picture, self._horizon_px), self._view)
 
     def _normalised_tracks(self, tracks: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -230,7 +232,8 @@ def check_lane_width(lane_width_m: float | None) -> None:
 
 
 def normalised(segments: Segments, view: CameraParameters) -> Lines:
-    """`segments` as straight lines between the rays of their ends."""
+    """Convert segments from px of the camera `view` to normalised coordinates: straight lines
+    between the rays of their ends."""
     half = 0.5 * segments.rows
     ends = [
         view.rays(

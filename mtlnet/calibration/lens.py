@@ -1,4 +1,4 @@
-"""The lens of a camera before its mount is estimated: given, from the EXIF of a photo, or
+"""Finds the lens of a camera before its mount is estimated: given, from the EXIF of a photo, or
 guessed."""
 
 from dataclasses import dataclass, replace
@@ -11,11 +11,11 @@ from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 
 GUESSED_FOV_DEG = 65.0
-"""Guessed field of view along the longer side, degrees: a phone's main lens films 55 to 70, a dash
-camera 70 and more."""
+"""Guessed field of view along the longer side, degrees. In a film it is 55 to 70 degrees for a
+phone's main lens, and at least 70 degrees for a dash camera."""
 GUESSED_STD, PHOTO_STD = 0.2, 0.05
-"""Relative standard deviations of the focal length: guessed, and from a photo; phones crop their
-films a little."""
+"""Relative standard deviations of a guessed focal length, and of the focal length in a photo's
+EXIF. Phones crop their films a little, so the film's focal length differs from the photo's."""
 FILM_DIAGONAL_MM = 43.27
 """Diagonal of 36 x 24 mm film, the reference of EXIF's 35 mm focal length (CIPA DC-008)."""
 EXIF_DIRECTORY, FOCAL_35MM = 0x8769, 0xA405
@@ -39,11 +39,11 @@ def find_lens(
     fov_y_deg: float | None = None,
     photo: Path | None = None,
 ) -> KnownLens:
-    """The lens of pictures of `size` (width, height).
+    """Return the lens of pictures of `size` (width, height).
 
-    The lens is the first of these that is known: the lens `given`, the field of view `fov_y_deg`,
-    the focal length of `photo`; else it is a guess. Its position on the car is the position of the
-    model's camera. Raises UserError.
+    The lens is the first of these that is not None: the lens `given`, the field of view
+    `fov_y_deg`, the focal length of `photo`; else it is a guess. Unless it is `given`, its position
+    on the car is the position of the model's camera. Raises UserError.
     """
     width, height = size
     if given is not None:
@@ -73,8 +73,8 @@ def find_lens(
 
 
 def photo_focal_share(path: Path) -> float:
-    """Focal length of a JPEG photo relative to the picture's longer side, from its EXIF. Raises
-    UserError."""
+    """Read the focal length of a JPEG photo from its EXIF, relative to the picture's longer side.
+    Raises UserError if there is none."""
     picture = read_whole_image(path)
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)

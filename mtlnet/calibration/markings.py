@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_WIDTH = 0.3
-"""Maximum width of a bar, in rows below the horizon: paint of 0.36 m for a camera at 1.2 m."""
+"""Maximum width of a bar in px over the number of rows below the horizon: paint 0.36 m wide for a
+camera 1.2 m above the road."""
 MARGIN_PX = 2.0
 MIN_CONTRAST = 14.0
 """Least difference in grey levels by which a bar is brighter (or yellower) than both its sides."""
@@ -40,8 +41,8 @@ class Segments:
 
 
 def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
-    """The segments of bars in an RGB picture below row `horizon_px`, a guess that sets their
-    width."""
+    """Find the segments of bars in an RGB picture (H, W, 3). `horizon_px`: estimated row of the
+    horizon, on which the expected width of the bars depends."""
     height = len(picture)
     top = int(np.clip(horizon_px + 0.02 * height, 0, height - MIN_ROWS))
     below = cv2.GaussianBlur(picture[top:], (3, 3), 0.0).astype(np.float32)
@@ -53,7 +54,8 @@ def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
 
 
 def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
-    """Each pixel minus the brighter of the two pixels `reach` (rows,) px to its left and right."""
+    """Return the grey level of each pixel minus the larger one of the two pixels `reach` (rows,) px
+    to its left and right; 0 where one of them is outside the picture."""
     width = level.shape[1]
     columns = np.arange(width)
     shift = np.rint(reach).astype(np.int64)[:, None]
@@ -65,7 +67,7 @@ def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
 
 
 def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Segments:
-    """Bars of `response` that continue over several rows, each as a straight line."""
+    """Fit straight segments to the bars of `response` (rows, columns), whose first row is `top`."""
     noise = 1.4826 * float(np.median(np.abs(response)))
     mask = response > max(MIN_CONTRAST, 2.0 * noise)
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
@@ -85,7 +87,7 @@ def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Seg
 
 
 def _fit_lines(piece: NDArray[np.int64], v: NDArray[np.int64], u: FloatArray) -> Segments:
-    """Least squares of u over v for each `piece`; short and curved pieces are left out."""
+    """Fit u over v by least squares to the points of each `piece`; drop short or curved pieces."""
     n = np.bincount(piece).astype(np.float64)
     mean_u, mean_v = np.bincount(piece, u) / n, np.bincount(piece, v) / n
     du, dv = u - mean_u[piece], v - mean_v[piece]

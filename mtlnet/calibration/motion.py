@@ -1,4 +1,4 @@
-"""The camera's rotation and direction of travel between two pictures, from followed points.
+"""Estimates a camera's rotation and direction of travel between two pictures from followed points.
 
 Camera frame: x right, y down, z ahead. For a small rotation `w` and travel along T, the ray p = (x,
 y, 1) of a point at rest moves by v with (T x p) . (v + w x p) = 0, whatever its distance
@@ -20,9 +20,9 @@ MIN_SPREAD_PX = 8
 WINDOW = (21, 21)
 LEVELS = 4
 MAX_RETURN_PX = 0.5
-"""Maximum distance between a point and its position after it was followed forward and back."""
+"""Maximum distance (px) of a point from its position after it was followed forward and back."""
 BONNET = 0.12
-"""Share of rows at the bottom that are ignored (the car's bonnet)."""
+"""Share of the picture's rows, at its bottom, that are ignored: they can show the car's bonnet."""
 ROUNDS = 8
 MIN_MOTION_PX = 0.5
 MAX_CONDITION = 1e12
@@ -30,8 +30,8 @@ MAX_CONDITION = 1e12
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion between two pictures: rotation of the camera (3,) rad, and the point that it travels
-    to, x and y in normalised coordinates."""
+    """Motion between two pictures: rotation of the camera (3,) rad, and the point towards which it
+    travels (2,), x and y in normalised coordinates, with its standard deviation."""
 
     rotation: FloatArray
     towards: FloatArray
@@ -39,8 +39,8 @@ class Motion:
 
 
 def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | None:
-    """Points that are found in two grayscale images: (N, 4), u and v in px in `before`, then in
-    `after`. None where too few points can be followed or nothing moves."""
+    """Follow points between two grayscale images; returns (N, 4): u and v in px in `before`, then
+    in `after`. None if too few points can be followed or nothing moves."""
     seen = np.full(before.shape, 255, np.uint8)
     seen[round((1 - BONNET) * len(seen)) :] = 0
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)
@@ -58,8 +58,8 @@ def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | 
 
 
 def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> tuple[Any, Any]:
-    """Positions of points (N, 1, 2) in `after`, and which were found (N, 1), by Lucas and
-    Kanade."""
+    """Follow points (N, 1, 2) by the method of Lucas and Kanade; returns their positions in `after`
+    and a flag (N, 1), 1 for the points that were found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, np.empty_like(points), winSize=WINDOW, maxLevel=LEVELS
     )
@@ -67,8 +67,11 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> t
 
 
 def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion | None:
-    """Motion from normalised `tracks` (N, 4). `towards` (2,): a first guess of the point that the
-    camera travels to. `noise`: standard deviation of a track, in normalised coordinates."""
+    """Estimate the motion from normalised `tracks` (N, 4); None if they do not determine it.
+
+    `towards` (2,): a first guess of the point towards which the camera travels. `noise`: standard
+    deviation of a track, in normalised coordinates.
+    """
     n = len(tracks)
     p = np.column_stack([0.5 * (tracks[:, :2] + tracks[:, 2:]), np.ones(n)])
     v = np.column_stack([tracks[:, 2:] - tracks[:, :2], np.zeros(n)])
@@ -87,7 +90,7 @@ def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion
         weight = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2) ** 2
         held = np.diag(
             [0.0, 0.0, 0.0, *(2 * [(scale / 0.05) ** 2])]
-        )  # the guess holds to 3 degrees
+        )  # the guess has a standard deviation of 3 degrees
         system = design.T @ (weight[:, None] * design) + held
         pull = held[3:, 3:] @ (heading[:2] - towards)
         right = -design.T @ (weight * error) - np.concatenate([np.zeros(3), pull])

@@ -1,8 +1,9 @@
 """Estimates a camera's mount from many pictures of a drive: robust means and their spread.
 
-Pitch and yaw come from the vanishing point of the markings on straight road, and from the point
-that the camera travels to; roll from the lane's width, which must not depend on the car's position
-in the lane; height from the lane's width. Bends, hills and the driver's corrections average out.
+Pitch and yaw are computed from the vanishing point of the markings on straight road, and from the
+point towards which the camera travels. The roll is the one for which the measured width of the lane
+does not depend on the car's position in it. The height is computed from the lane's width. Bends,
+hills and the driver's corrections average out.
 """
 
 from collections.abc import Sequence
@@ -29,10 +30,10 @@ OWN_LANE_STD, OWN_LANE_REPEAT = 0.015, 3.0
 """Relative standard deviation of the measured width of the car's own lane in a picture; number of
 consecutive pictures whose errors are similar."""
 NEXT_LANES_ROLL_STD = np.radians(1.0)
-"""Standard deviation of the roll at which the neighbouring lanes look as wide as the car's own
-lane: roads fall off to both sides, and lanes differ in width."""
+"""Standard deviation (rad) of the roll for which the neighbouring lanes look as wide as the car's
+own lane. It is large, because roads fall off to both sides and lanes differ in width."""
 MIN_SLOPE = 0.25
-"""Least slope of the markings of the car's own lane; with a smaller one, the car is changing
+"""Least slope of the markings of the car's own lane. If a slope is smaller, the car is changing
 lanes."""
 ROLL_PRIOR = np.radians(2.0)
 FLOOR = np.radians(0.1)
@@ -52,7 +53,7 @@ class NotCalibrated(UserError):
 
 @dataclass(frozen=True)
 class Sample:
-    """Segments of one picture, and its time in s."""
+    """The segments of markings in one picture, and its time in s."""
 
     time_s: float
     lines: Lines
@@ -60,7 +61,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class TimedMotion:
-    """Motion between two pictures, `seconds` apart."""
+    """The motion between two pictures, `seconds` apart; `time_s`: time of the first one."""
 
     time_s: float
     seconds: float
@@ -69,7 +70,8 @@ class TimedMotion:
 
 @dataclass(frozen=True)
 class Mount:
-    """Angles in rad and height in m with their standard deviations; number of pictures used."""
+    """The camera's angles in rad and height in m, their standard deviations, and the number of
+    pictures used."""
 
     pitch: float
     yaw: float
@@ -84,8 +86,8 @@ class Mount:
 
 @dataclass(frozen=True)
 class _Roads:
-    """N fits, a column for each quantity. `lane`: difference of the slopes of the own lane's
-    markings."""
+    """The road fits of N pictures: an array (N,) for each quantity. `lane`: difference of the
+    slopes of the own lane's markings."""
 
     time_s: FloatArray
     x0: FloatArray
@@ -96,8 +98,8 @@ class _Roads:
     sideways: FloatArray
     """Speed to the right, in camera heights per second; NaN where unknown."""
     widths: FloatArray
-    """Widths of all lanes (M, 4): index of the fit, difference of slopes, their mean, 1 for the own
-    lane."""
+    """A row for each lane of all pictures, (M, 4): index of the fit, difference of the slopes of
+    its two markings, their mean, 1 for the own lane."""
 
 
 def find_mount(
@@ -107,7 +109,7 @@ def find_mount(
     lane_width_m: float,
     lane_width_std_m: float,
 ) -> Mount:
-    """The mount; `start`: the film's vanishing point in normalised coordinates. Raises
+    """Estimate the mount. `start`: the film's vanishing point in normalised coordinates. Raises
     NotCalibrated."""
     roll, level = 0.0, start
     for _ in range(ROLL_ROUNDS):
@@ -152,8 +154,8 @@ def _straight(roads: _Roads) -> NDArray[np.bool_]:
 
 
 def _lane_widths(fits: Sequence[RoadFit], lane_width_m: float) -> FloatArray:
-    """Widths of the lanes between neighbouring markings, as in `_Roads.widths`, that are close to
-    the usual width of the own lane."""
+    """Return `_Roads.widths`: the lanes between neighbouring markings whose width is close to the
+    usual width of the own lane."""
     rows = []
     for k, fit in enumerate(fits):
         for left, right in zip(fit.slopes[:-1], fit.slopes[1:], strict=True):
@@ -170,8 +172,8 @@ def _lane_widths(fits: Sequence[RoadFit], lane_width_m: float) -> FloatArray:
 
 
 def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
-    """Slope of `place` (N,) over `time` within WINDOW_S; NaN where too little is known or the car
-    changes lanes."""
+    """Return the rate of change (N,) of `place` (N,) over `time` (N,), from the values within
+    WINDOW_S; NaN where there are too few values or the car changes lanes."""
     found = np.full(len(time), np.nan)
     for k in range(len(time)):
         near = (np.abs(time - time[k]) <= WINDOW_S) & np.isfinite(place)
@@ -185,8 +187,8 @@ def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
 
 
 def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
-    """The correction of `roll` with which the measured width of the lane does not depend on the
-    car's position in it, and the standard deviation of the corrected roll.
+    """Return the correction of `roll` after which the measured width of the lane does not depend on
+    the car's position in it, and the standard deviation of the corrected roll, both in rad.
 
     A roll r widens a lane by 1 + 2 r c, where c is the mean slope of its two markings.
     """
@@ -208,7 +210,7 @@ def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
 
 
 def _vanishing_point(roads: _Roads, rows: NDArray[np.int64]) -> tuple[float, float]:
-    """Vanishing point x0, y0 of straight road for a car that moves along it."""
+    """Return the vanishing point x0, y0 of straight road for a car that moves along the road."""
     weight = 1.0 / (roads.y0_std[rows] ** 2 + 0.004**2)
     y0 = robust.mean(roads.y0[rows], weight)
     speeds = np.isfinite(roads.sideways[rows])
@@ -265,8 +267,8 @@ def _combine(
 def _travel(
     motions: Sequence[TimedMotion], roll: float, rng: np.random.Generator
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """The point that the camera travels to while the car runs straight ahead, level x and y, and
-    their standard deviations."""
+    """Return the point towards which the camera travels while the car drives straight ahead: x and
+    y, corrected for roll, and their standard deviations. None with too few motions."""
     level = [m for m in motions if np.abs(m.motion.rotation[1]) < MAX_TURN * m.seconds]
     if len(level) < MIN_PICTURES:
         return None
@@ -290,8 +292,8 @@ def _travel(
 
 
 def _weighted(values: list[float], stds: list[float]) -> tuple[float, float]:
-    """Mean weighted by inverse variance, with FLOOR added; its standard deviation includes the
-    difference between the values."""
+    """Return the mean weighted by inverse variances, to which FLOOR squared is added, and its
+    standard deviation, which includes the difference between the values."""
     weight = np.array([1.0 / (std**2 + FLOOR**2) for std in stds])
     found = float(np.dot(weight, values) / weight.sum())
     return found, float(max(weight.sum() ** -0.5, np.ptp(values) / 2))

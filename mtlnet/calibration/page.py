@@ -18,7 +18,7 @@ WIDTH = 640
 """Width of the pictures on the page, px."""
 SEEN, PROJECTED, LANE, HORIZON = (0, 200, 60), (255, 60, 0), (255, 120, 0), (0, 160, 255)
 ERROR_SCALE = 20.0
-"""Factor by which errors are drawn longer."""
+"""Factor by which the drawn errors are longer than the errors."""
 LANE_AHEAD_M = np.linspace(3.0, 60.0, 120)
 
 Picture = NDArray[np.uint8]
@@ -60,7 +60,7 @@ def _lens_lines(found: BoardCalibration) -> list[str]:
 
 
 def draw_corners(picture: BoardPicture) -> Picture:
-    """The picture at `WIDTH` with its corners, and their errors if it was used."""
+    """Return the picture, `WIDTH` px wide, with its corners, and their errors if it was used."""
     image = read_whole_image(picture.path)
     scale = WIDTH / image.shape[1]
     image = _scaled(image, scale)
@@ -108,7 +108,7 @@ def write_drive_page(path: Path, drive: CalibratedDrive, name: str) -> None:
 
 
 def draw_lane(picture: Picture, camera: CameraParameters, lane_width_m: float) -> Picture:
-    """The picture at `WIDTH` with the horizon and a straight lane drawn in."""
+    """Return the picture, `WIDTH` px wide, with the horizon and a straight lane drawn in."""
     image = _scaled(picture, WIDTH / picture.shape[1])
     camera = camera.resized(image.shape[1], image.shape[0])
     road = -camera.cg_height_m

@@ -1,4 +1,4 @@
-"""The road's vanishing point, bend and slopes of markings, from the segments of one picture.
+"""Fits the road's vanishing point, bend and slopes of markings to the segments of one picture.
 
 Normalised image coordinates x, y: pixels from the principal point divided by the focal length,
 corrected for roll. A marking of a flat road is x = x0 + a s + b / s with s = y - y0 > 0. Here (x0,
@@ -14,24 +14,26 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 MIN_BELOW = 0.05
-"""Least distance of a segment below the horizon: at most 24 m ahead for a camera at 1.2 m."""
+"""Least distance of a segment below the horizon: 24 m ahead for a camera 1.2 m above the road."""
 MAX_SLOPE = 8.0
 SEARCH = (0.09, 0.07)
 """Maximum distance of a picture's vanishing point from the film's, in x (heading) and y."""
 MIN_CROSSING = 0.8
-"""Least difference of slopes of two segments that give a candidate for the vanishing point."""
+"""Least difference of the slopes of two segments whose intersection is a candidate for the
+vanishing point."""
 POINTING_STD = 0.008
 MIN_LINE_WEIGHT = 0.05
 """Least total height of the segments of a marking."""
 BEND_STD = 0.004
-"""Standard deviation of the prior of b: a radius of 150 m for a camera at 1.2 m."""
+"""Standard deviation of the prior of b: a radius of 150 m for a camera 1.2 m above the road."""
 MAX_FIT_STD = 0.02
 ROUNDS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Segments (N,) in normalised coordinates; `size` is the height of each."""
+    """N segments in normalised coordinates: middle x, y; slope dx/dy with its standard deviation;
+    height `size`."""
 
     x: FloatArray
     y: FloatArray
@@ -40,13 +42,13 @@ class Lines:
     size: FloatArray
 
     def chosen(self, rows: NDArray[np.bool_]) -> "Lines":
-        """The segments selected by a mask (N,)."""
+        """Return the segments selected by the mask `rows` (N,)."""
         return Lines(
             self.x[rows], self.y[rows], self.slope[rows], self.slope_std[rows], self.size[rows]
         )
 
     def turned(self, roll: float) -> "Lines":
-        """The segments as seen by a camera without the roll (rad) of this one."""
+        """Return the segments as a camera without this camera's `roll` (rad) would see them."""
         c, s = np.cos(roll), np.sin(roll)
         along = c + self.slope * s  # the vertical part of (slope, 1) after the rotation
         return Lines(
@@ -60,7 +62,8 @@ class Lines:
 
 @dataclass(frozen=True)
 class RoadFit:
-    """Result for one picture; the standard deviation includes the error of the fit only."""
+    """The fit of one picture: vanishing point x0, y0, and bend b. `y0_std` includes only the error
+    of the fit."""
 
     x0: float
     y0: float
@@ -71,8 +74,8 @@ class RoadFit:
 
 
 def fit_road(lines: Lines, x0: float, y0: float) -> RoadFit | None:
-    """The fit near the film's vanishing point (x0, y0); None where the markings do not determine
-    it."""
+    """Fit the road near the film's vanishing point (x0, y0); None where the markings do not
+    determine the fit."""
     usable = (lines.y > y0 + MIN_BELOW) & (np.abs(lines.slope) < MAX_SLOPE)
     lines = lines.chosen(usable)
     start = _crossing(lines, x0, y0)
@@ -82,7 +85,8 @@ def fit_road(lines: Lines, x0: float, y0: float) -> RoadFit | None:
 
 
 def _crossing(lines: Lines, x0: float, y0: float) -> tuple[float, float, FloatArray] | None:
-    """The candidate that most segments point to, and the slopes of the markings seen from it."""
+    """Return x and y of the vanishing point to which most segments point, and the slopes of the
+    markings; None without such a point."""
     first, second = np.triu_indices(len(lines.x), 1)
     crossing = np.abs(lines.slope[first] - lines.slope[second]) > MIN_CROSSING
     first, second = first[crossing], second[crossing]
@@ -110,7 +114,7 @@ def _crossing(lines: Lines, x0: float, y0: float) -> tuple[float, float, FloatAr
 
 
 def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray:
-    """Slopes of the markings: means of groups of segments with similar slopes."""
+    """Return the slopes of the markings: the means of groups of segments with similar slopes."""
     order = np.argsort(slope)
     slope, std, size = slope[order], std[order], size[order]
     gap = np.diff(slope) > 0.12 + std[1:] + std[:-1]
@@ -122,8 +126,8 @@ def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray
 
 
 def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit | None:
-    """Gauss-Newton over (x0, y0, b, slopes); each segment is assigned to the marking that it lies
-    on."""
+    """Refine (x0, y0, b, slopes) by the Gauss-Newton method; each segment is assigned to the
+    marking that it lies on. None if the result is too uncertain."""
     state: FloatArray = np.array([x0, y0, 0.0, *slopes])
     covariance: FloatArray = np.zeros((0, 0))
     for step in range(ROUNDS):
@@ -150,16 +154,19 @@ def _below(lines: Lines, y0: float) -> FloatArray:
 
 
 def _slope_std(lines: Lines, below: FloatArray) -> FloatArray:
-    """Standard deviation of the difference between the slopes of a segment and of its marking, with
-    the part that an uneven road adds."""
+    """Return the standard deviation (N,) of the difference between the slopes of a segment and of
+    its marking, including the effect of an uneven road."""
     return np.asarray(np.hypot(lines.slope_std, 0.02 + 0.004 / below), np.float64)
 
 
 def _members(
     lines: Lines, state: FloatArray, wide: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
-    """A mask of the segments that lie on a marking, the index of each one's marking among the kept
-    markings, and a mask of the kept markings."""
+    """Assign the segments to markings; returns a mask of the segments that lie on a kept marking,
+    the index of each segment's marking among the kept markings, and a mask of the kept markings.
+
+    `wide`: factor on the allowed distance of a segment from its marking.
+    """
     x0, y0, bend = state[:3]
     slopes, below = state[3:], _below(lines, y0)
     away = lines.x[:, None] - (x0 + slopes * below[:, None] + bend / below[:, None])
@@ -175,8 +182,9 @@ def _members(
 def _equations(
     lines: Lines, marking: NDArray[np.int64], state: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Design matrix (2 N + 1, P) and errors of the positions and slopes of segments, divided by
-    their standard deviations and weighted by Huber's weights; the last row is free."""
+    """Return the design matrix (2 N + 1, P) and the errors (2 N + 1,) of the positions and slopes
+    of the segments, divided by their standard deviations and weighted by Huber's weights. The
+    caller fills the last row with the prior of b."""
     x0, y0, bend = state[:3]
     s, a, n = _below(lines, y0), state[3:][marking], len(lines.x)
     own = 3 + marking

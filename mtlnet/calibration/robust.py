@@ -9,11 +9,12 @@ FloatArray = NDArray[np.float64]
 
 ROUNDS = 12
 TUNING = 1.5
-"""Number of standard deviations from which an error counts linearly (Huber 1981)."""
+"""Errors above this number of standard deviations count linearly, not squared (Huber 1981)."""
 
 
 def fit(design: FloatArray, values: FloatArray, weight: FloatArray) -> FloatArray:
-    """Coefficients (P,) of `values` (N,) = `design` (N, P) @ coefficients, with Huber's weights."""
+    """Return coefficients (P,) of `values` (N,) = `design` (N, P) @ coefficients, fitted with the
+    weights `weight` (N,) times Huber's weights."""
     root = np.sqrt(weight)
     found: FloatArray = np.zeros(design.shape[1])
     scale = root
@@ -28,7 +29,7 @@ def fit(design: FloatArray, values: FloatArray, weight: FloatArray) -> FloatArra
 
 
 def mean(values: FloatArray, weight: FloatArray | None = None) -> float:
-    """Huber's mean of `values` (N,)."""
+    """Return Huber's robust mean of `values` (N,)."""
     ones = np.ones((len(values), 1))
     return float(fit(ones, values, np.ones(len(values)) if weight is None else weight)[0])
 
@@ -39,8 +40,9 @@ def bootstrap_std(
     rng: np.random.Generator,
     draws: int = 60,
 ) -> FloatArray:
-    """Standard deviations of `estimate(rows)` over resampled blocks of rows (Efron 1979): half the
-    spread of the middle 68 %. `block` (N,): the block of each row."""
+    """Return the standard deviations of `estimate(rows)` over resampled blocks of rows (bootstrap,
+    Efron 1979): half the width of the central 68 % interval. `block` (N,): the block of each row.
+    """
     rows_of = [np.flatnonzero(block == name) for name in np.unique(block)]
     found = []
     for _ in range(draws):

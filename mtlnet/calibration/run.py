@@ -1,5 +1,5 @@
-"""`mtlnet calibrate`: a camera file from pictures of a board, from a film, or from consecutive
-pictures of a drive."""
+"""`mtlnet calibrate`: makes a camera file from pictures of a board, from a film, or from
+consecutive pictures of a drive."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,10 +21,10 @@ from trackfeatures.errors import UserError
 def calibrate(
     config: CalibrateConfig, report: Report = lambda done, total: None
 ) -> tuple[dict[str, Any], str]:
-    """Write the camera file; returns the result, and a line of text about it.
+    """Calibrate the camera and write its file; returns the result of `--json`, and a line of text.
 
-    Raises UserError, also for a film that is truncated or damaged. The camera file is written
-    before that if the readable part is sufficient.
+    Raises UserError, also for a truncated or damaged film. In that case the camera file has been
+    written if the readable part of the film is sufficient.
     """
     check_folder(config.out)
     if config.page is not None:
@@ -98,7 +98,7 @@ def _calibrate_drive(
 
 
 def _with_exif(path: Path) -> Path | None:
-    """The picture if its EXIF states the focal length, else None."""
+    """Return `path` if the picture's EXIF contains the focal length, else None."""
     from mtlnet.calibration.lens import photo_focal_share
 
     try:

@@ -1,4 +1,4 @@
-"""The film's vanishing point to half a degree: where most segments of markings intersect.
+"""Finds the film's vanishing point to half a degree: the point to which most segments point.
 
 Intersections on bends, during lane changes and of objects not along the road are scattered; the
 intersections of straight driving coincide.
@@ -19,7 +19,8 @@ SMOOTHING_CELLS = 2.0
 
 
 def find_vanishing_point(pictures: Iterable[Lines]) -> tuple[float, float] | None:
-    """x0, y0 in normalised coordinates; None where no segment points into the range."""
+    """Return the vanishing point x0, y0 in normalised coordinates; None if no segment points into
+    the searched range."""
     across, down = (np.arange(-reach, reach + STEP_DEG / 2, STEP_DEG) for reach in REACH_DEG)
     y0 = np.tan(np.radians(down))
     votes = np.zeros((len(down), len(across)))
