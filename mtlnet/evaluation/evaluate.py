@@ -40,8 +40,8 @@ def evaluate(
     worst: Path | None = None,
     copies: str = "",
 ) -> dict[str, Any]:
-    """The report of `mtlnet.evaluation.metrics` on one split of a dataset, for all frames and by
-    group.
+    """Evaluate a model on one split of a dataset; returns the report for all frames and by group
+    (`mtlnet.evaluation.metrics`).
 
     `engines`: the same model once per thread. `report(done, total)` is called after each chunk of
     frames. `page`: an HTML file to write, or its folder; `worst`: a JPEG to write of the frames
@@ -94,10 +94,11 @@ def evaluate_custom_images(
     copies: Sequence[str] = (PLAIN,),
     page: Path | None = None,
 ) -> dict[str, Any]:
-    """The report on a user's own pictures with a `labels.csv` (`mtlnet.evaluation.pictures`).
+    """Evaluate a model on a user's own pictures with a `labels.csv`; returns the report
+    (`mtlnet.evaluation.pictures`).
 
     `copies`: kinds of `mtlnet.data.picture_copies`. `page`: an HTML file to write. Pictures that
-    show too little of the model's view are counted. Raises UserError for faulty files.
+    show too little of the model's view are only counted. Raises UserError for faulty files.
     """
     engine = engines[0]
     images = open_custom_images(folder, engine.card.camera, copies, skip_refused=True)
@@ -118,7 +119,7 @@ def evaluate_custom_images(
 
 
 def about(engine: Engine) -> dict[str, Any]:
-    """The entries of a report that describe the model."""
+    """Return the entries of a report that describe the model."""
     return {
         "model": engine.card.name,
         "model_hash": engine.card.model_hash,
@@ -130,7 +131,8 @@ def about(engine: Engine) -> dict[str, Any]:
 def predict_rounds(
     engines: Sequence[Engine], frames: Frames, data: Path, report: Callable[[int, int], None]
 ) -> NDArray[np.float32]:
-    """The outputs of `predict_frames` for recorded rounds, in metres at the car.
+    """Run the model on recorded rounds; returns outputs (N, K; columns: `split_outputs`), converted
+    from the camera of each round to the car.
 
     Raises DatasetError with the names of all undecodable images.
     """
@@ -146,7 +148,8 @@ def predict_frames(
     frames: Images,
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """Outputs (N, K; columns: `split_outputs`) for all frames, one thread per engine.
+    """Run the model on all frames, with one thread per engine; returns outputs (N, K; columns:
+    `split_outputs`).
 
     An engine computes one frame at a time, as in the service; on a GPU it computes `CHUNK` frames
     at once.
@@ -176,7 +179,8 @@ def predict_frames(
 
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
-    """Raise ModelError when the camera differs, or when the model was trained on these rounds."""
+    """Raise ModelError when the camera differs, or when the model was trained on these rounds (only
+    for the splits test and unseen)."""
     require_camera(card, frames.camera)
     if "mean" not in card.data:
         raise ModelError(

@@ -1,4 +1,4 @@
-"""The evaluation as one self-contained HTML page: `mtlnet evaluate --report FILE`."""
+"""Writes an evaluation as one self-contained HTML page: `mtlnet evaluate --report FILE`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ FILE_NAME = "report.html"
 MAX_ROUNDS = 8
 """Maximum number of rounds drawn along the track."""
 HEAVY_SHADOW = 0.3
-"""Share of the road in shadow above which an interval of a plot is shaded."""
+"""Intervals of a plot in which at least this share of the road is in shadow are shaded."""
 UNITS = {name: "rad" if name == "angle" else "m" for name in FEATURES}
 TITLES = {name: f"{name} ({unit})" for name, unit in UNITS.items()}
 
@@ -34,7 +34,7 @@ Rows = list[list[str]]
 
 
 def page_file(path: Path) -> Path:
-    """The file of the page for `path`, a file or a folder; makes the folder."""
+    """Return the file of the page for `path`, a file or a folder; makes the folder."""
     if path.is_dir():
         path = path / FILE_NAME
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,14 +42,16 @@ def page_file(path: Path) -> Path:
 
 
 def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
-    """Write the page for a report of `mtlnet.evaluation.evaluate` to `path`, a file or a folder."""
+    """Write the page of a report of `mtlnet.evaluation.evaluate` to `path`, a file or a folder;
+    returns the file."""
     path = page_file(path)
     atomic_write(path, page(report, frames, outputs), fsync=True)
     return path
 
 
 def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
-    """HTML page of `report` on `outputs` (N, K; columns: `split_outputs`) for `frames`."""
+    """Return the HTML page of `report`, with charts and worst frames of the model's outputs (N, K;
+    columns: `split_outputs`) for `frames`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     return render(
         "mtlnet.evaluation",
@@ -97,7 +99,7 @@ def _reliability(uncertainty: dict[str, Any]) -> Iterator[Markup]:
 
 
 def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A table for each grouping: title, mean errors by feature, accuracy of the class."""
+    """Yield a table for each grouping: mean errors by feature, and accuracy of the class."""
     for grouping, label in GROUPS.items():
         head = [label, "frames", *TITLES.values(), "class"]
         if "uncertainty" in report:
@@ -116,7 +118,7 @@ def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[dict[str, Any]]:
-    """For the first round of each track: true and predicted offset and angle."""
+    """Yield charts of the true and predicted offset and angle in the first round of each track."""
     shown: set[str] = set()
     for number, info in enumerate(frames.rounds):
         rows = np.flatnonzero(frames.labels.round == number)
@@ -159,8 +161,8 @@ def _drive_charts(
 
 
 def _distance_driven(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance from the first frame (N,), m, from track positions s; crossing the start line adds
-    0."""
+    """Return the distance driven (N,) since the first frame, m, from the track positions s (N,), m.
+    The step across the start line, where s jumps back, counts as 0."""
     steps = np.diff(s)
     steps[steps < 0] = 0.0
     return np.concatenate([[0.0], np.cumsum(steps)])
@@ -177,7 +179,7 @@ shown once."""
 
 @dataclass(frozen=True)
 class WorstFrame:
-    """Frame `row`, in which `feature` has the signed `error` (m or rad)."""
+    """The frame with the index `row`, in which `feature` has the signed `error` (m or rad)."""
 
     row: int
     feature: str
@@ -185,7 +187,8 @@ class WorstFrame:
 
 
 def worst_frames(errors: NDArray[np.float64], rounds: NDArray[np.int64]) -> list[WorstFrame]:
-    """The `WORST_PER_FEATURE` worst frames of each feature, from errors (N, 7) and rounds (N,)."""
+    """Return the `WORST_PER_FEATURE` frames with the largest errors of each feature, at different
+    parts of the road, from `errors` (N, 7) and the frames' `rounds` (N,)."""
     chosen: list[WorstFrame] = []
     for i in (5, 6, 0, 1, 3, 2, 4):
         sizes = np.abs(errors[:, i])
@@ -205,7 +208,7 @@ def worst_frames(errors: NDArray[np.float64], rounds: NDArray[np.int64]) -> list
 def worst_figures(
     frames: Frames, outputs: NDArray[np.float32], chosen: list[WorstFrame]
 ) -> Iterator[dict[str, Any]]:
-    """For each chosen frame: its image (truth green, prediction orange) and its caption.
+    """Yield for each chosen frame its image (truth green, prediction orange) and its caption.
 
     Keys: `image`, RGB at twice the frame's size; texts `feature`, `error`, `note`, `place`.
     """
@@ -252,7 +255,8 @@ CAPTION_PX = 48
 
 
 def write_worst_sheet(path: Path, frames: Frames, outputs: NDArray[np.float32]) -> Path:
-    """Write the frames with the largest errors of each feature as one JPEG with captions."""
+    """Write the frames with the largest errors of each feature as one JPEG with captions; returns
+    `path`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     figures = list(worst_figures(frames, outputs, worst_frames(errors, frames.labels.round)))
     height, width = frames.camera.height, frames.camera.width

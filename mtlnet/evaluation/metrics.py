@@ -1,8 +1,9 @@
-"""Metrics of a model's outputs on labelled frames: errors in m and rad, by feature.
+"""Computes metrics of a model's outputs on labelled frames: errors in m and rad, by feature.
 
 A feature is one of `mtlnet.inference.prediction.FEATURES`: the five markings, `to_lane_centre` and
-`angle`. Errors are predicted minus true; they are NaN, and not counted, where the label is inactive
-or unknown. The baseline is a constant prediction, the mean of the training labels.
+`angle`. An error is the predicted minus the true value; it is NaN, and not counted, where the label
+is inactive (absent) or unknown. The baseline is a constant prediction, the mean of the training
+labels.
 """
 
 from collections.abc import Iterator
@@ -24,7 +25,8 @@ CALIBRATION_BINS = 10
 
 
 def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> NDArray[np.float64]:
-    """Errors (N, 7) of outputs (N, K; columns: `split_outputs`).
+    """Return the errors (N, 7), in the order of `FEATURES`, m and rad, of a model's outputs (N, K;
+    columns: `split_outputs`). `distances` (N, 5) and `angle` (N,) are the labels.
 
     The error of a marking is the error of the predicted value, even if the value decodes to
     "inactive". `to_lane_centre` has an error where both label and prediction have a value.
@@ -36,8 +38,8 @@ def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> N
 
 
 def error_percentiles(errors: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:
-    """For each feature by name: mean, median, 95th and 99th percentile of the absolute error, and
-    number of frames."""
+    """Return, for each feature by name, mean, median, 95th and 99th percentile of the absolute
+    error, and the number of frames, from `errors` (N, 7)."""
     return {name: _percentiles(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
 
 
@@ -53,7 +55,7 @@ def _percentiles(sizes: NDArray[np.float64]) -> dict[str, float | None]:
 def confusion(
     heading: NDArray[np.int64], predicted: NDArray[np.int64]
 ) -> dict[str, dict[str, int]]:
-    """Number of frames by true class and predicted class."""
+    """Count the frames by true class and predicted class: {true: {predicted: count}}."""
     known = heading != UNKNOWN_HEADING
     heading, predicted = heading[known], predicted[known]
     names = [kind.name.lower() for kind in tf.RoadClass]
@@ -66,8 +68,8 @@ def confusion(
 
 
 def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | None]]:
-    """For each feature by name: shares of its errors (N, 7) within one and two of its standard
-    deviations (N, 7).
+    """Return, for each feature by name, the shares of its errors (N, 7) that are within one and
+    within two of the predicted standard deviations (N, 7).
 
     For normally distributed errors the shares are 0.683 and 0.954.
     """
@@ -79,8 +81,8 @@ def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | 
 def calibration(
     std: NDArray[Any], errors: NDArray[np.float64]
 ) -> dict[str, list[dict[str, float]]]:
-    """For each feature by name: predicted standard deviations and observed errors, in bins of equal
-    count.
+    """Compare predicted standard deviations (N, 7) with errors (N, 7): for each feature by name,
+    bins of equal count in the order of the standard deviation.
 
     Each bin has the root mean square of the predicted standard deviations ("said"), the root mean
     square of the errors ("found"), and the number of frames.
@@ -123,7 +125,7 @@ SPEED_KMH = (30.0, 45.0, 60.0)
 
 
 def groups(frames: Frames) -> Iterator[tuple[str, dict[str, NDArray[np.int64]]]]:
-    """Yields, for each grouping, its name in `GROUPS` and the rows of its groups, in order.
+    """Yield, for each grouping, its name in `GROUPS` and, by group, the indices of its frames.
 
     Each frame is in one group of every grouping.
     """
@@ -159,10 +161,10 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: LabelArrays, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on `outputs` (N, K; columns: `split_outputs`) for `labels`.
+    """Return the report on a model's `outputs` (N, K; columns: `split_outputs`) for `labels`.
 
-    `mean`: the result of `mean_labels`. The report has the key `uncertainty` when the model
-    predicts standard deviations.
+    `mean`: the means of the training labels (`mtlnet.data.description.mean_labels`). The report has
+    the key `uncertainty` when the model predicts standard deviations.
     """
     errors = signed_errors(outputs, labels.distances, labels.angle)
     heading = outputs[:, 6:OUTPUTS].argmax(1)
@@ -193,7 +195,11 @@ def evaluate_outputs(
 def evaluate_by_groups(
     outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """The report on all frames, with reports on the groups of frames under `by_track`, ..."""
+    """Return the report on all frames; under `by_track` and the other keys of `GROUPS` it has a
+    report for each group of frames.
+
+    `outputs` (N, K; columns: `split_outputs`); `mean`: the means of the training labels.
+    """
     labels = frames.labels
     report = evaluate_outputs(outputs, labels, mean)
     std = split_outputs(outputs).std
@@ -209,7 +215,7 @@ def evaluate_by_groups(
 
 
 def _means(errors: NDArray[np.float64], right: NDArray[np.bool_]) -> dict[str, Any]:
-    """Mean absolute errors, and accuracy of the class."""
+    """Return the mean absolute errors of `errors` (N, 7), and the mean of `right`, the accuracy."""
     sizes = [_mean(np.abs(column)) for column in errors.T]
     by_name = dict(zip(FEATURES, sizes, strict=True))
     return {
@@ -221,7 +227,7 @@ def _means(errors: NDArray[np.float64], right: NDArray[np.bool_]) -> dict[str, A
 
 
 def feature_mean(means: dict[str, Any], name: str) -> float | None:
-    """Mean error of feature `name` in a report, or in its `baseline` or `ratio`."""
+    """Return the mean error of feature `name` in a report, or in its `baseline` or `ratio`."""
     keys = {"to_lane_centre": "to_lane_centre_mae_m", "angle": "angle_mae_rad"}
     found: float | None = means[keys[name]] if name in keys else means["mae_m"][name]
     return found
@@ -235,7 +241,7 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
 
 
 def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float | None]:
-    """The losses of the paper's table, on coded values, inactive ones included.
+    """Return the losses of the paper's table, on coded values, including inactive distances.
 
     `distance`, `angle`: mean over the frames of the squared error, summed over the five distances,
     as in training; `distance_absolute`, `angle_absolute`: the same with the absolute error; `type`:
@@ -261,8 +267,8 @@ def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str,
 def presence(
     outputs: NDArray[np.float32], labels: LabelArrays
 ) -> dict[str, dict[str, float | None]]:
-    """For each distance by name: share of active labels predicted as inactive, and share of
-    inactive labels predicted as active."""
+    """Return, for each marking and `to_lane_centre` by name, the share of active labels that are
+    predicted as inactive, and the share of inactive labels that are predicted as active."""
     distances, _ = tf.decode(outputs[:, :6])
     truth = labels.distances
     inactive = np.isnan(np.column_stack([distances, tf.localise(distances)]))
@@ -278,7 +284,7 @@ def presence(
 
 
 def _baseline_errors(mean: dict[str, Any], labels: LabelArrays) -> NDArray[np.float64]:
-    """Errors (N, 7) of the constant prediction `mean`."""
+    """Return the errors (N, 7) of always predicting `mean`."""
     distances = [np.nan if d is None else d for d in mean["distances_m"]]
     offset = mean["to_lane_centre_m"] - tf.localise(labels.distances)
     angle = mean["angle_rad"] - labels.angle

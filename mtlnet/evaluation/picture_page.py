@@ -1,5 +1,6 @@
-"""The evaluation on a user's own pictures as one HTML page: `mtlnet evaluate --data FOLDER --report
-FILE`. Each picture shows its label (green) and the model's answer (orange); failures come first."""
+"""Writes an evaluation on a user's own pictures as one HTML page: `mtlnet evaluate --data FOLDER
+--report FILE`. Each picture shows its label (green) and the model's answer (orange); failures come
+first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -46,17 +47,18 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Case:
-    """A picture or copy on the page, with its row in the answers or the reason for its refusal."""
+    """A picture or copy on the page. `row`: its index in the answers; None if it was refused."""
 
     picture: LabelledPicture
     copy: str
     row: int | None
     verdict: str
-    """A text about the failure; empty if there is none."""
+    """A text about the failure or refusal; empty if there is none."""
 
 
 def write_picture_page(path: Path, report: dict[str, Any], answers: Answers) -> Path:
-    """Write the page for a report of `mtlnet.evaluation.pictures.picture_report` to `path`."""
+    """Write the page of a report of `mtlnet.evaluation.pictures.picture_report` to `path`; returns
+    `path`."""
     figures = report["pictures"]
     page = render(
         "mtlnet.evaluation",
@@ -124,10 +126,10 @@ def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def cases(answers: Answers) -> list[Case]:
-    """All pictures and copies, failures first.
+    """Return all pictures and copies, failures first.
 
-    The order: refused pictures, absent answers, then all other pictures by their largest error. An
-    error is divided by the mean error of its feature.
+    The order: refused pictures, absent answers, then all other pictures by their largest error. For
+    this comparison an error is divided by the mean error of its feature.
     """
     images = answers.images
     sizes = np.abs(answers.errors)
@@ -150,7 +152,7 @@ def cases(answers: Answers) -> list[Case]:
 
 
 def _figure(answers: Answers, case: Case) -> dict[str, Any]:
-    """Figure of a case: the picture with label and answer drawn in, and the caption."""
+    """Return the figure of a case: the picture with label and answer drawn in, and its caption."""
     picture, row = case.picture, case.row
     place = ", ".join(text for text in (picture.drive, picture.light) if text)
     name = picture.file if case.copy == "plain" else f"{picture.file}, {case.copy}"
@@ -176,7 +178,7 @@ def _figure(answers: Answers, case: Case) -> dict[str, Any]:
 
 
 def _drawn(answers: Answers, case: Case) -> Image:
-    """The picture or copy with label and answer drawn in, at most `WIDTH_PX` wide."""
+    """Return the picture or copy with label and answer drawn in, at most `WIDTH_PX` px wide."""
     images, picture = answers.images, case.picture
     whole = read_whole_image(images.path / picture.file)
     scale = min(1.0, WIDTH_PX / whole.shape[1])
@@ -203,6 +205,6 @@ def _drawn(answers: Answers, case: Case) -> Image:
 
 
 def source_camera(images: CustomImages, row: int) -> CameraParameters:
-    """Camera of the picture or copy in a row, at its own size."""
+    """Return the camera of the picture or copy with the index `row`, at the camera's own size."""
     lens = images.lenses[row]
     return images.camera if lens is None else lens.source

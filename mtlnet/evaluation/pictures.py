@@ -33,15 +33,15 @@ class Answers:
     outputs: NDArray[np.float32]
     """Outputs (N, K; columns: `split_outputs`) in metres at the pictures' own cameras."""
     true: NDArray[np.float64]
-    """Labels (N, 5), NaN where absent or unknown."""
+    """Labels (N, 5) in the order of `FEATURES`, NaN where absent or unknown."""
     found: NDArray[np.float64]
-    """Answers (N, 5), NaN where absent."""
+    """The model's answers (N, 5) in the order of `FEATURES`, NaN where absent."""
     trained: frozenset[str]
     """SHA-256 of the picture files that the model was trained on."""
 
     @cached_property
     def trained_files(self) -> frozenset[str]:
-        """Names of the files that the model was trained on."""
+        """Names of the labelled files that the model was trained on."""
         pairs = zip(self.images.pictures, self.images.hashes, strict=True)
         return frozenset(picture.file for picture, found in pairs if found in self.trained)
 
@@ -73,8 +73,8 @@ class Answers:
 def judge(
     images: CustomImages, outputs: NDArray[np.float32], trained: Sequence[str] = ()
 ) -> Answers:
-    """The answers for `outputs` (N, K; columns: `split_outputs`), the model's outputs for the
-    rectified images."""
+    """Convert the model's outputs (N, K; columns: `split_outputs`) for the rectified images to
+    answers at the pictures' own cameras. `trained`: hashes of the pictures of the training."""
     outputs = images.outputs(outputs)
     distances, angle = tf.decode(outputs[:, :6])
     labels = images.labels
@@ -88,8 +88,8 @@ def judge(
 
 
 def _features(distances: NDArray[Any], angle: NDArray[Any]) -> NDArray[np.float64]:
-    """Values (N, 5) of `FEATURES`, NaN where absent or unknown, from distances (N, 5) and angles
-    (N,)."""
+    """Return the values (N, 5) of `FEATURES`, NaN where absent or unknown, from distances (N, 5)
+    and angles (N,)."""
     known = np.where(np.isinf(distances), np.nan, distances).astype(np.float64)
     offset = tf.localise(distances)
     offset = np.where(np.isinf(offset), np.nan, offset)
@@ -97,9 +97,10 @@ def _features(distances: NDArray[Any], angle: NDArray[Any]) -> NDArray[np.float6
 
 
 def picture_report(answers: Answers, mean: dict[str, Any]) -> dict[str, Any]:
-    """The report of `mtlnet.evaluation.metrics`; its key `pictures` has the report of this module.
+    """Return the report of `evaluate_outputs` with the further key `pictures`, whose value has
+    counts and errors for all pictures and by group (`part_report`).
 
-    `mean`: the baseline, from `mtlnet.data.description.mean_labels`.
+    `mean`: the means of the training labels, which are the baseline's prediction.
     """
     labels = answers.images.labels
     report = evaluate_outputs(answers.outputs, labels, mean)
@@ -125,7 +126,7 @@ def _pictures(answers: Answers) -> list[LabelledPicture]:
 
 
 def group_of(answers: Answers, name: str, picture: LabelledPicture, copy: str) -> str:
-    """Group of a picture's copy in the grouping `name` of `GROUPS`."""
+    """Return the group of a picture's copy in the grouping `name`, a key of `GROUPS`."""
     if name == "by_copy":
         return copy
     if name == "by_training":
@@ -149,7 +150,8 @@ def _groups(answers: Answers, name: str) -> Iterator[tuple[str, dict[str, Any]]]
 
 
 def part_report(answers: Answers, chosen: Callable[[LabelledPicture, str], bool]) -> dict[str, Any]:
-    """Figures of the chosen pictures and copies.
+    """Return counts and errors of the pictures and copies for which `chosen(picture, copy)` is
+    true.
 
     `mean`, `median`: mean and median of the absolute errors; `mean_of_drives`: the mean of the
     drives' means; `always_median`: the mean error of always answering the median of the chosen
@@ -180,8 +182,8 @@ def part_report(answers: Answers, chosen: Callable[[LabelledPicture, str], bool]
 
 
 def _coverage(answers: Answers, rows: Any) -> dict[str, list[float | None]]:
-    """The result of `mtlnet.evaluation.metrics.coverage`, with the labels' variances added to the
-    predicted variances."""
+    """Return, for each feature by name, the shares of errors within one and two standard
+    deviations. The variance is the sum of the predicted variance and the label's variance."""
     labels = answers.images.labels.take(rows)
     outputs = answers.outputs[rows]
     std = split_outputs(outputs).std
@@ -191,7 +193,7 @@ def _coverage(answers: Answers, rows: Any) -> dict[str, list[float | None]]:
 
 
 def _over(statistic: Callable[[Any], Any], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Statistic of each column's values that are not NaN; NaN for a column without values."""
+    """Return `statistic` of each column's values that are not NaN; NaN for an empty column."""
     columns = (column[~np.isnan(column)] for column in values.T)
     return np.array([statistic(c) if len(c) else np.nan for c in columns], np.float64)
 

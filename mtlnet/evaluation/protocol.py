@@ -1,9 +1,10 @@
 """Evaluates a model as the paper does (Li et al., section VII), on rounds of `datagen protocol`:
 `mtlnet evaluate --protocol paper --data datasets/protocol`.
 
-Errors are mean absolute errors, in m and rad: of the offset from the middle of the one-lane road
-and of the yaw angle, on whole drives and in four intervals of heavy shadow. The class is evaluated
-on held-out rounds of nine tracks, whose full report (`mtlnet.evaluation.metrics`) is included.
+The errors are mean absolute errors, in m and rad, of the offset from the middle of the one-lane
+road and of the yaw angle, on whole drives and in four intervals of heavy shadow. The class is
+evaluated on held-out rounds of nine tracks, whose full report (`mtlnet.evaluation.metrics`) is
+included.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,8 +27,8 @@ PAPER = "paper"
 INTERVALS = 4
 INTERVAL_FRAMES = 200
 """Number of frames of an interval: 10 s at 20 Hz. The paper marks four intervals of heavy shadow on
-its lap without their lengths. Here the whole lap is in shadow, so the intervals are its darkest
-parts."""
+its lap but does not state their lengths. Here the whole lap is in shadow, so the intervals are its
+darkest parts."""
 FOUR = "four darkest intervals"
 DRIVES = {
     ("g-track-3", "heavy-shadow"): "g-track-3, heavy shadow",
@@ -41,8 +42,8 @@ STATED: dict[str, dict[str, float]] = {
     DRIVES["dirt-3", "clear"]: {"distance_m": 0.107, "angle_rad": 0.004},
     "nine tracks, held-out rounds": {"heading_accuracy": 0.9878},
 }
-"""The paper's figures: the figures on g-track-3 and dirt-3 are from its text, the accuracy on nine
-tracks (MTL 3) is from its table II."""
+"""The results that the paper states: on g-track-3 and dirt-3 in its text, the accuracy on nine
+tracks (MTL 3) in its table II."""
 
 Rows = NDArray[np.int64]
 
@@ -54,7 +55,8 @@ def evaluate_protocol(
     report: Callable[[int, int], None] = lambda *_: None,
     every: int = 1,
 ) -> dict[str, Any]:
-    """The report on the held-out rounds; its entry `protocol` has the rows of the paper's table.
+    """Evaluate a model by the paper's protocol; returns the report on the held-out rounds, whose
+    entry `protocol` has the rows of the paper's table.
 
     A row is for a drive, a part of a drive, or all held-out rounds that are no drive. Its entry
     `paper` has the paper's figures. `every`: evaluate every n-th frame only. Raises UserError for
@@ -88,7 +90,7 @@ def evaluate_protocol(
 
 
 def drive_rows(frames: Frames, data: Path) -> dict[str, Rows]:
-    """Rows of the frames of each drive of `DRIVES`, in order.
+    """Return, by the names of `DRIVES`, the indices of the frames of each drive, in order.
 
     Raises UserError if a drive is missing, or if all rounds are drives.
     """
@@ -121,7 +123,7 @@ def protocol_rows(
     every: int,
     held_out: dict[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """The rows of the table: drives, four intervals of heavy shadow, held-out rounds of nine
+    """Return the rows of the table: drives, four intervals of heavy shadow, held-out rounds of nine
     tracks.
 
     `outputs` (N, K; columns: `split_outputs`); `rows`: the result of `drive_rows`; `held_out`: the
@@ -149,8 +151,8 @@ def protocol_rows(
 
 
 def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
-    """Up to `INTERVALS` disjoint intervals of `window` frames, in order, with the largest mean
-    shadow.
+    """Return up to `INTERVALS` disjoint intervals of `window` frames with the largest mean shadow,
+    each as an array of frame indices, in order.
 
     `shadow` (N,): share of the road in shadow. The intervals are chosen one after another. They are
     shorter where N is too small for all of them.
@@ -166,7 +168,7 @@ def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
 
 
 def drive_figures(outputs: NDArray[np.float32], labels: Labels) -> dict[str, Any]:
-    """The figures of a drive or of a part of a drive: the figures of the paper, and some more.
+    """Return the results of a drive or of a part of a drive.
 
     `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest errors; `zero_...`:
     the errors of always answering zero, which are the mean sizes of the labels; `absent`: frames

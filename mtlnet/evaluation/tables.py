@@ -1,4 +1,4 @@
-"""Results of the `mtlnet` commands as tables and text for the terminal."""
+"""Formats the results of the `mtlnet` commands as tables and text for the terminal."""
 
 from typing import Any
 
@@ -20,20 +20,20 @@ DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
 
 
 def error_cells(result: dict[str, Any], name: str) -> list[str]:
-    """Cells of a feature's errors: mean, median, percentiles, the training mean's error, and
-    ratio."""
+    """Return the cells of a feature's errors: mean, median, 95th and 99th percentile, error of the
+    baseline (the training mean), ratio of the mean error to it."""
     baseline, ratio = (feature_mean(result[part], name) for part in ("baseline", "ratio"))
     sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), baseline]
     return [*(format_number(v, DIGITS[name]) for v in sizes), format_number(ratio, 2)]
 
 
 def mean_error_cells(result: dict[str, Any]) -> list[str]:
-    """Cells of the mean error of each feature."""
+    """Return a cell with the mean error of each feature."""
     return [format_number(result["errors"][f]["mean"], DIGITS[f]) for f in FEATURES]
 
 
 def report_tables(result: dict[str, Any]) -> list[Table]:
-    """The tables of a report of `mtlnet evaluate`, one for each part of the report."""
+    """Make the tables of a report of `mtlnet evaluate`, one for each part of the report."""
     makers = {
         "protocol": protocol_table,
         "mae_m": evaluation_table,
@@ -45,7 +45,8 @@ def report_tables(result: dict[str, Any]) -> list[Table]:
 
 
 def evaluation_table(result: dict[str, Any]) -> Table:
-    """Errors of a model on active labels, and the errors of always answering the training mean."""
+    """Make the table of a model's errors on active labels, and of the errors of a baseline that
+    always answers the training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
     table = Table(title=escape(printable(title)))
     for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):
@@ -60,7 +61,8 @@ def evaluation_table(result: dict[str, Any]) -> Table:
 
 
 def protocol_table(result: dict[str, Any]) -> Table:
-    """Figures of the paper's protocol with the paper's own in brackets; fits in 80 columns."""
+    """Make the table of the paper's protocol, with the paper's figures in brackets; it fits in 80
+    columns."""
     title = f"{result['model']} by the paper's protocol (in brackets: the paper)"
     table = Table(title=escape(printable(title)))
     table.add_column("")
@@ -83,7 +85,7 @@ def _percent(stated: float | None) -> str:
 
 
 def group_table(result: dict[str, Any]) -> Table:
-    """Mean absolute errors by track, lane count, light, shadow, bend and speed."""
+    """Make the table of mean absolute errors by track, lane count, light, shadow, bend, speed."""
     table = Table(title="by groups (m, rad)", box=None, padding=(0, 0, 0, 1))
     short = ("centre" if name == "to_lane_centre" else name for name in FEATURES)
     for column in ("", "frames", *short, "class"):
@@ -98,7 +100,7 @@ def group_table(result: dict[str, Any]) -> Table:
 
 
 def picture_table(result: dict[str, Any]) -> Table:
-    """Mean absolute errors on a user's own pictures, by drive and light."""
+    """Make the table of mean absolute errors on a user's own pictures, by group of pictures."""
     figures = result["pictures"]
     title = (
         f"{figures['cases']} pictures: {figures['refused']} refused, {figures['absent']} absent, "
@@ -124,8 +126,8 @@ def _add_picture_row(
 
 
 def uncertainty_table(result: dict[str, Any]) -> Table:
-    """Shares of errors within one and two predicted standard deviations; share of frames classified
-    as out of distribution."""
+    """Make the table of the shares of errors within one and two predicted standard deviations, with
+    the share of frames classified as out of distribution in its title."""
     uncertainty = result["uncertainty"]
     share = (
         f"{uncertainty['out_of_distribution']:.1%} of the frames classified as out of distribution"
@@ -139,7 +141,7 @@ def uncertainty_table(result: dict[str, Any]) -> Table:
 
 
 def prediction_table(predictions: list[dict[str, Any]]) -> Table:
-    """The track features predicted for images."""
+    """Make the table of the track features predicted for images."""
     table = Table(title="track features (m, rad)", box=None, padding=(0, 0, 0, 1))
     table.add_column("image", overflow="fold")
     for column in (*tf.MARKINGS, "to lane centre", "angle", "heading"):
@@ -157,7 +159,7 @@ def prediction_table(predictions: list[dict[str, Any]]) -> Table:
 
 
 def export_lines(result: dict[str, Any]) -> str:
-    """Result of an export: files, largest differences from torch, and the accuracy gate."""
+    """Return the result of an export as text: files, differences from torch, accuracy gate."""
     check, gate = result["check"], result.get("gate")
     lines = [
         f"{result['out']}: {', '.join(result['files'])}",
