@@ -131,8 +131,8 @@ def about(engine: Engine) -> dict[str, Any]:
 def predict_rounds(
     engines: Sequence[Engine], frames: Frames, data: Path, report: Callable[[int, int], None]
 ) -> NDArray[np.float32]:
-    """Run the model on recorded rounds; returns outputs (N, K; columns: `split_outputs`), converted
-    from the camera of each round to the car.
+    """Run the model on recorded rounds; returns outputs (N, K; columns: `split_outputs`), corrected
+    for rounds whose camera is mounted at another position than the model's camera.
 
     Raises DatasetError with the names of all undecodable images.
     """

@@ -1,2 +1,2 @@
-"""Writing trained networks for deployment: OpenVINO graph, int8, ONNX, the model in a run's
-folder."""
+"""Writes trained networks for deployment: as OpenVINO graph, in int8, as ONNX, and as the model in
+a run's folder."""

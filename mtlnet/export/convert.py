@@ -1,9 +1,9 @@
 """`mtlnet export --model RUN --format onnx|openvino --precision f32|bf16|int8`.
 
-f32: as trained. bf16: large weights are stored in bf16 and converted to float32 where they are
-read. int8: only OpenVINO, see `mtlnet.export.int8`; the engine uses it by default once it has
-passed its accuracy gate on the test rounds. Each export is compared with torch on frames of a
-dataset.
+With f32 the weights stay as trained. With bf16 large weights are stored in bf16, and the graph
+converts them to float32. int8 is possible for OpenVINO only (`mtlnet.export.int8`); the engine uses
+an int8 graph by default if it has passed its accuracy gate on the test rounds. Each export is
+compared with torch on frames of a dataset.
 
 ONNX and OpenVINO models take any number of images at once (first axis, "batch") and give the same
 answers as for single images. The int8 graph takes one image, as the engine does, because a graph
@@ -58,7 +58,7 @@ ONNX_FILE = "model.onnx"
 OPSET = 18
 CHECK_BATCH = 3  # images at once
 MAX_CHECK_FRAMES = 10_000
-"""Maximum number of frames, whose images are held in memory (1.8 GB)."""
+"""Maximum number of frames of a comparison, whose images are held in memory (1.8 GB)."""
 
 
 def export_model(
@@ -71,8 +71,8 @@ def export_model(
 ) -> dict[str, Any]:
     """Write the model of `run` in another format and check it; returns the result of `--json`.
 
-    It is checked on `frames` frames of the dataset `data`, by default the training data. Raises
-    UserError for an unsupported export, ModelError when the result differs from torch.
+    The result is compared with torch on `frames` frames of the dataset `data`, by default the
+    training data. Raises UserError for an unsupported export, ModelError when the result differs.
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
@@ -120,11 +120,11 @@ def export_model(
 
 
 def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
-    """The int8 form of a graph, and the numbers of the convolutions with float activations.
+    """Return a graph in int8, and the numbers of its convolutions with float activations.
 
-    These are chosen on the rounds that fitted the uncertainty head, if they are a part of
-    `dataset`, divided as at that time; otherwise on a part of the dataset's train rounds, which the
-    calibration then does not use.
+    These convolutions are chosen on the rounds on which the uncertainty head was fitted, if these
+    rounds are a part of `dataset`; otherwise on a part of the dataset's train rounds, which is then
+    not used for the calibration.
     """
     fitted = card.uncertainty or {}
     train, held_out = parts = hold_out_rounds(dataset)
@@ -161,7 +161,7 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
 
 
 class OnnxNetwork(ServedNetwork):
-    """A network without uncertainty head: images uint8 (B, H, W, 3) -> (B, 9).
+    """A network without uncertainty head, from uint8 images (B, H, W, 3) to its outputs (B, 9).
 
     With heads over bins there is a second result (B, 5): probabilities that each marking is absent.
     """
@@ -174,7 +174,7 @@ class OnnxNetwork(ServedNetwork):
 
 
 def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]:
-    """Write `model.onnx`, one file; `bf16`: large weights in bf16. Returns the file names."""
+    """Write `model.onnx`, one file; returns its name. `bf16`: large weights are stored in bf16."""
     import onnx
 
     images = torch.zeros((2, HEIGHT, WIDTH, 3), dtype=torch.uint8)  # torch would fix a size of 1
@@ -225,7 +225,8 @@ def store_onnx_bf16(model: Any) -> None:
 
 
 def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
-    """Write `model.xml` and `model.bin`; `precision` bf16: large weights in bf16."""
+    """Write the files of an OpenVINO model; returns their names. With the `precision` bf16, large
+    weights are stored in bf16."""
     import openvino
 
     model.inputs[0].get_node().set_layout(openvino.Layout("[batch,height,width,colour]"))
@@ -239,7 +240,8 @@ def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
 def check_export(
     network: Network, path: Path, precision: str, images: NDArray[np.uint8]
 ) -> dict[str, Any]:
-    """Largest differences of the nine outputs, computed by OpenVINO, from torch in float32.
+    """Return the largest differences between the nine outputs of the file `path`, computed by
+    OpenVINO, and the outputs of torch in float32, for `images` (N, H, W, 3).
 
     The images are computed in batches, except for int8, whose graph takes one image.
     """

@@ -1,12 +1,12 @@
-"""The int8 form of a graph (by NNCF), and the accuracy gate that it must pass.
+"""Quantises a graph to int8 (by NNCF), and judges it by the accuracy gate.
 
-The weights of all convolutions and of all shared layers except the last are quantised, and so are
-the activations of most convolutions, calibrated on training frames. Which convolutions keep float
-activations is chosen by greedy forward selection until the gate is passed on train rounds that were
-held out of the training (for another dataset: on a twelfth of its train rounds). The gate itself
-uses the test rounds, on which nothing is chosen. The fully connected layers are memory-bound. The
-last one is small but loses as much accuracy in int8 as the other two together, so it stays in
-float.
+The weights of all convolutions and of all shared layers except the last are quantised. The
+activations of most convolutions are quantised too, calibrated on training frames. Greedy forward
+selection chooses the convolutions that keep float activations, until the gate is passed on train
+rounds that were held out of the training (for another dataset: on a twelfth of its train rounds).
+The gate itself uses the test rounds, on which nothing is chosen. The fully connected layers are
+memory-bound. The last one is small but loses as much accuracy in int8 as the other two together, so
+it stays in float.
 """
 
 import logging
@@ -29,22 +29,22 @@ from runtime.processor import has_int8
 
 CALIBRATION_FRAMES = 300
 FLOAT_ACTIVATIONS: tuple[int, ...] = (0, 2)
-"""Numbers of the convolutions with float activations where no choice is made. In the paper's
-network, quantising the activations of the first convolution costs more distance accuracy than
-quantising all others together, and the third costs more angle accuracy than all others together."""
+"""Default numbers of the convolutions with float activations. In the paper's network, quantising
+the activations of the first convolution costs more distance accuracy than quantising all others
+together, and quantising those of the third costs more angle accuracy than all others together."""
 MAX_FLOAT_ACTIVATIONS, MAX_CONVOLUTIONS = 3, 16
 """Maximum number of convolutions with float activations; maximum number of convolutions of a
-network for which the choice is made."""
+network for which they are searched. A network with more convolutions gets `FLOAT_ACTIVATIONS`."""
 HELD_OUT_FRAMES = 4_000
 MARGIN = 0.5
-"""Share of the gate's limits that a choice may use on the held-out rounds, because the first choice
-that passes among many tends to be a lucky one."""
+"""A choice must stay within this share of the gate's limits on the held-out rounds, because the
+first of many choices that passes can have passed by chance."""
 LIMITS = {"distance_m": 0.003, "angle_rad": 0.0002, "accuracy": 0.001}
 """Maximum increase of an error over float32: m, rad, and share of the frames."""
 
 
 def calibration_images(train: Frames) -> NDArray[np.uint8]:
-    """Evenly spaced frames (N, H, W, 3) of the train rounds."""
+    """Read evenly spaced frames (N, H, W, 3) of the train rounds."""
     count = min(CALIBRATION_FRAMES, len(train))
     return train.read_batch(np.linspace(0, len(train) - 1, count).astype(np.int64))
 
@@ -54,11 +54,11 @@ def choose_float_activations(
 ) -> tuple[int, ...]:
     """Choose the convolutions that keep float activations, on held-out train rounds.
 
-    `images`: for the calibration; `mean`: of the training labels. Returns the first choice that
-    stays within `MARGIN` of the gate's limits on these frames, or else the choice nearest to that.
-    The order: no convolution; each convolution alone, from the fewest multiplications up; the best
-    of these with each other one; and so on. A network with too many convolutions gets
-    `FLOAT_ACTIVATIONS`.
+    `images` (N, H, W, 3): frames for the calibration; `mean`: means of the training labels. Returns
+    the first choice that stays within `MARGIN` of the gate's limits on the held-out rounds, or else
+    the choice nearest to that. The order: no convolution; each convolution alone, from the fewest
+    multiplications up; the best of these with each other convolution; and so on. A network with too
+    many convolutions gets `FLOAT_ACTIVATIONS`.
     """
     rows = np.linspace(0, len(held_out) - 1, min(HELD_OUT_FRAMES, len(held_out))).astype(np.int64)
     frames, labels = held_out.read_batch(rows), model_labels(held_out).take(rows)
@@ -85,7 +85,7 @@ def choose_float_activations(
 
 
 def convolutions_by_work(model: Any) -> list[int]:
-    """Numbers of a model's convolutions, from the fewest multiplications up."""
+    """Return the numbers of a model's convolutions, from the fewest multiplications up."""
     operations = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
     work = [
         int(np.prod(list(op.get_output_shape(0))[2:])) * int(np.prod(list(op.get_input_shape(1))))
@@ -97,7 +97,7 @@ def convolutions_by_work(model: Any) -> list[int]:
 def quantise(
     model: Any, images: NDArray[np.uint8], float_activations: Sequence[int] = FLOAT_ACTIVATIONS
 ) -> Any:
-    """The int8 form of an OpenVINO model, calibrated on `images` (N, H, W, 3).
+    """Quantise an OpenVINO model to int8, calibrated on `images` (N, H, W, 3).
 
     `float_activations`: numbers of the convolutions whose activations are not quantised.
     """
@@ -122,21 +122,21 @@ def quantise(
 
 
 def operation_names(model: Any, kind: str) -> list[str]:
-    """Names of a model's operations of type `kind`, in topological order."""
+    """Return the names of a model's operations of type `kind`, in topological order."""
     operations = model.get_ordered_ops()
     return [op.get_friendly_name() for op in operations if op.get_type_name() == kind]
 
 
 def float_weights(model: Any) -> list[str]:
-    """Names of the MatMuls whose weights are not quantised: all but the shared layers, and the
-    last of these."""
+    """Return the names of the MatMuls whose weights are not quantised: the last shared layer, and
+    all that are no shared layers."""
     products = operation_names(model, "MatMul")
     shared = [name for name in products if ".shared." in name]
     return [name for name in products if name not in shared[:-1]]
 
 
 def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
-    """Names of the operations whose activations are not quantised.
+    """Return the names of the operations whose activations are not quantised.
 
     These are the `chosen` convolutions, and all operations that no convolution depends on: shared
     layers, heads and texture features.
@@ -157,9 +157,9 @@ def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
 
 
 def judge(run: Path, data: Path) -> dict[str, Any]:
-    """Result of the gate for a run's int8 graph, on the test rounds of a dataset.
+    """Evaluate a run's int8 graph on the test rounds of a dataset; returns the result of the gate.
 
-    It also has "native_int8": whether the processor that judged it multiplies int8 natively.
+    It also has "native_int8": whether the processor of this evaluation multiplies int8 natively.
     """
 
     def evaluated(precision: Literal["f32", "int8"]) -> dict[str, Any]:
@@ -189,7 +189,7 @@ def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]
         if before is not None and after is not None
     }
     lost = [name for name, pair in pairs.items() if (pair[0] is None) != (pair[1] is None)]
-    # In this form a NaN fails.
+    # `not ... <=` instead of `>`, so that a NaN fails.
     failed = [name for name, by in worse.items() if not by <= _limit(name)]
     return {
         "passed": not failed and not lost and bool(worse),
@@ -202,5 +202,6 @@ def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]
 
 
 def _limit(name: str) -> float:
-    """Maximum increase of the error of a feature, or of the share of wrong classes."""
+    """Return the maximum increase of a feature's error (m or rad), or of the share of wrong
+    classes."""
     return LIMITS[{"angle": "angle_rad", "accuracy": "accuracy"}.get(name, "distance_m")]

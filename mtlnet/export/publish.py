@@ -43,13 +43,14 @@ from trackfeatures.names import to_name
 
 PACKAGES = ("driverview", "torch", "openvino", "numpy")
 LEAST_OOD_SCORE = 1e-3
-"""Least out-of-distribution score in a comparison. A model of a single training image gives that
-image a score of 0, apart from rounding; an image with a score above 1 is out of distribution."""
+"""Least out-of-distribution score by which a difference is divided in a comparison. A model of a
+single training image gives that image a score of 0, apart from rounding; an image with a score
+above 1 is out of distribution."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a network was trained; these are fields of the model card."""
+    """The settings and data with which a network was trained; fields of the model card."""
 
     camera: CameraParameters = field(default_factory=CameraParameters)
     alpha: tuple[float, float, float] = (0.3, 0.2, 0.5)
@@ -67,7 +68,8 @@ def publish(
     provenance: Provenance | None = None,
     uncertainty: FittedUncertainty | None = None,
 ) -> ModelCard:
-    """Fold `network` and write `MODEL_FILES`, the uncertainty head and the card to folder `run`.
+    """Fold `network`, write weights, graph, uncertainty head and card to the folder `run`, and
+    return the card.
 
     `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
     `uncertainty` the model predicts no standard deviations. Without OpenVINO the run gets no graph,
@@ -111,7 +113,7 @@ def write_model(
     """Write weights, graph and uncertainty head of a folded `network` to `folder`; returns the hash
     of each file.
 
-    Without OpenVINO there is no graph. `narrow`: the graph stores float16 weights as such.
+    Without OpenVINO no graph is written. `narrow`: the graph stores float16 weights in float16.
     """
     names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
     atomic_write(folder / WEIGHTS, save(weights), fsync=True)
@@ -125,7 +127,7 @@ def write_model(
 
 
 def golden_outputs(network: Network) -> tuple[float, ...]:
-    """The outputs (9,) of a folded network for the golden image."""
+    """Return the outputs (9,) of a folded network for the golden image, a fixed test image."""
     images = golden_image(WIDTH, HEIGHT)[None]
     return tuple(map(float, predict_images(network, images)[0]))
 
@@ -133,7 +135,7 @@ def golden_outputs(network: Network) -> tuple[float, ...]:
 def _require_equal(run: Path, check: dict[str, float]) -> None:
     limits = {"openvino_f32_max": TOLERANCE, "openvino_f32_uncertainty": UNCERTAINTY_TOLERANCE}
     for name, limit in limits.items():
-        if not check.get(name, 0.0) <= limit:  # in this form a NaN fails too
+        if not check.get(name, 0.0) <= limit:  # not `>`, so that a NaN fails too
             raise ModelError(
                 f"the exported graph {run / GRAPH} differs from torch by {check[name]:.2g} "
                 f"({name}), at most {limit:g} is expected: the model is not published; report this "
@@ -142,7 +144,7 @@ def _require_equal(run: Path, check: dict[str, float]) -> None:
 
 
 def export_text(check: Mapping[str, float]) -> str:
-    """Text about a card's `export_check`, whose number of frames is 0 if OpenVINO is not
+    """Return a text about a card's `export_check`, whose number of frames is 0 if OpenVINO is not
     installed."""
     if not check["frames"]:
         return "weights alone: OpenVINO, which writes the graph, is not installed"
@@ -156,7 +158,8 @@ def export_text(check: Mapping[str, float]) -> str:
 def compare_graph(
     network: Network, run: Path, images: NDArray[np.uint8], head: UncertaintyHead | None = None
 ) -> dict[str, float]:
-    """Largest difference between torch in float32 and the run's graph, by precision.
+    """Return the largest differences, over `images` (N, H, W, 3), between torch in float32 and the
+    run's graph, by precision.
 
     `openvino_PRECISION_max`: absolute, of the nine outputs and the probabilities of absence;
     `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs. The difference of
@@ -187,7 +190,7 @@ def compare_graph(
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that made the model."""
+    """Return the versions of Python and of the packages that make a model."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

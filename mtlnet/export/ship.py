@@ -1,8 +1,8 @@
-"""`mtlnet ship --model RUN --out DIR`: a model in half the bytes.
+"""`mtlnet ship --model RUN --out DIR`: writes a model at half the size.
 
-The folder has `model.safetensors` in float16, the uncertainty head in float32, the served graph of
-the same numbers and the card. Without OpenVINO no graph is written. Answers, and those in the card,
-are computed from the rounded weights. `write_page` adds a README.md with the figures of
+The folder has `model.safetensors` in float16, the uncertainty head in float32, the served graph
+with the same weights, and the card. Without OpenVINO no graph is written. The golden outputs in the
+card are computed from the rounded weights. `write_page` adds a README.md with the results of
 evaluations.
 """
 
@@ -81,7 +81,7 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
 
 
 def half(name: str, values: Tensor) -> Tensor:
-    """Weights in float16. Raises ModelError when one is outside its range."""
+    """Return the weights `values` in float16. Raises ModelError when one is outside its range."""
     rounded = values.half()
     if not rounded.isfinite().all():
         raise ModelError(f"{name} holds a weight beyond float16's range: train the model anew")
@@ -89,7 +89,7 @@ def half(name: str, values: Tensor) -> Tensor:
 
 
 def _without_folders(data: dict[str, Any]) -> dict[str, Any]:
-    """The description of training data with names of datasets instead of paths on this machine."""
+    """Return the description of the training data with names instead of paths of datasets."""
     named = {**data, "path": Path(data["path"]).name}
     if "earlier" in data:
         named["earlier"] = [{**one, "path": Path(one["path"]).name} for one in data["earlier"]]
@@ -97,9 +97,10 @@ def _without_folders(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check(run: Path, out: Path) -> dict[str, float]:
-    """Largest differences of the shipped weights' answers from torch, and from the run.
+    """Return the largest differences of the shipped graph's answers from torch's answers for the
+    shipped weights, and from the run's answers. Raises ModelError for too large a difference.
 
-    Without OpenVINO, torch's answers of the shipped weights are compared with the run's.
+    Without OpenVINO, torch's answers for the shipped weights are compared with the run's answers.
     """
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (CHECK_IMAGES, HEIGHT, WIDTH, 3), dtype=np.uint8)
@@ -122,15 +123,15 @@ def _check(run: Path, out: Path) -> dict[str, float]:
 
 
 def _answers(engine: Engine, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """Outputs (N, 9) for N images."""
+    """Return the nine outputs of an engine for N images, (N, 9)."""
     return np.stack([engine(image)[:OUTPUTS] for image in images])
 
 
 def write_page(
     model: Path, evaluations: Sequence[Path], notes: str = "", picture: Path | None = None
 ) -> Path:
-    """Write `README.md` to the model's folder: its card, `notes`, the figures by which its int8
-    graph was judged, if it has one, and the tables of evaluations.
+    """Write `README.md` to the model's folder: its card, `notes`, the result of its int8 graph's
+    accuracy gate, if it has one, and the tables of evaluations; returns the file.
 
     `evaluations`: files with the output of `mtlnet evaluate --json`; `picture`: a JPEG of the worst
     frames, which is copied to the folder. Raises UserError for an evaluation that is unreadable or

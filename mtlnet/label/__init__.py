@@ -1,1 +1,1 @@
-"""Labelling pictures by hand in the browser: `mtlnet label FOLDER`."""
+"""The page on which pictures are labelled by hand in the browser: `mtlnet label FOLDER`."""

@@ -1,4 +1,4 @@
-"""The folder being labelled: its pictures, their cameras, and the rows of `labels.csv`.
+"""The folder whose pictures are labelled: its pictures, their cameras, the rows of `labels.csv`.
 
 Each change rewrites `labels.csv` atomically, starting from the current file: rows of other pictures
 and columns that the page does not show are kept. Only files inside the folder are read.
@@ -32,16 +32,16 @@ from trackfeatures.definitions import BEND_CURVATURE
 from trackfeatures.errors import UserError
 
 KEPT = ("drive", "light", "camera", "std_m", "std_rad")
-"""Columns that saving a label keeps, unless the page gives them."""
+"""Columns whose values stay when a label is saved, unless the page sends new ones."""
 
 
 class LabelFolder:
-    """A folder with pictures. They are addressed by their number in `files`, whose order is
-    fixed."""
+    """A folder with pictures. A picture is addressed by its index in the fixed list `files`."""
 
     def __init__(self, folder: Path, camera_file: Path | None, model: CameraParameters) -> None:
-        """`camera_file`: the camera of pictures without their own; copied into the folder if it has
-        none. `model`: values missing in a camera file. Raises UserError."""
+        """Read the folder. `camera_file`: the camera of pictures without their own; it is copied
+        into the folder if it has none. `model`: the camera whose values replace missing values of a
+        camera file. Raises UserError."""
         if not folder.is_dir():
             raise UserError(f"there is no folder {folder}; give one with pictures")
         self.folder = folder.resolve()
@@ -83,7 +83,7 @@ class LabelFolder:
         return sorted(found, key=natural_key)
 
     def rows(self) -> dict[str, Cells]:
-        """Rows of `labels.csv` by file; empty if there is no such file.
+        """Return the rows of `labels.csv` by picture file; empty without a `labels.csv`.
 
         They are read again when the file has changed; do not change the returned dictionary.
         """
@@ -96,9 +96,9 @@ class LabelFolder:
         return self._rows[1]
 
     def picture(self, number: int) -> NDArray[np.uint8]:
-        """The whole picture, uint8 RGB (H, W, 3), read-only. Raises UserError.
+        """Read the whole picture, uint8 RGB (H, W, 3), read-only. Raises UserError.
 
-        The last one is kept: each drag of a marking asks for it again.
+        The last picture stays in memory, because each drag of a marking needs it again.
         """
         path = self.folder / self.files[number]
         if not path.resolve().is_relative_to(self.folder):
@@ -111,7 +111,8 @@ class LabelFolder:
         return picture
 
     def camera(self, number: int, width: int, height: int) -> CameraParameters:
-        """Camera of a picture, at the picture's size. Raises UserError."""
+        """Return the camera of picture `number`, resized to the picture's width and height (px).
+        Raises UserError."""
         row = self.rows().get(self.files[number], {})
         name = row.get("camera") or CAMERA_FILE
         path = self.folder / name
@@ -128,7 +129,7 @@ class LabelFolder:
         return camera.resized(width, height)
 
     def markings(self, number: int, camera: CameraParameters) -> Markings | None:
-        """Label of a picture; None if it has none, or one without a lane."""
+        """Return the label of a picture; None if it has no label, or a label without a lane."""
         row = self.rows().get(self.files[number], {})
         texts = {name: row.get(name) for name in ("ml", "mr", "l", "m", "r")}
         known = {
@@ -144,8 +145,8 @@ class LabelFolder:
     def save(self, number: int, markings: Markings, heading: str, texts: Cells) -> Cells:
         """Write the label of a picture; returns its row. `texts`: `drive` and `light`, if given.
 
-        `heading` empty: derived from the curvature, if the markings were drawn far enough (the
-        class looks 20 m ahead). Raises UserError for a label out of range.
+        If `heading` (the class) is empty, it is derived from the curvature, so the markings must
+        have been drawn 20 m ahead. Raises UserError for a label out of range.
         """
         if not heading:
             bend = "left" if markings.curvature > 0 else "right"
@@ -183,7 +184,8 @@ class LabelFolder:
 
 
 def _version(path: Path) -> tuple[object, ...]:
-    """Differs for another file and after each change of one. Raises UserError without the file."""
+    """Return a key of a file, which changes with each change of the file. Raises UserError if the
+    file does not exist."""
     try:
         found = path.stat()
     except OSError as error:

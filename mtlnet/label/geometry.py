@@ -1,4 +1,4 @@
-"""Metres, angle and curvature from the two markings of a lane, given as points of a picture.
+"""Computes distances, angle and curvature of a lane's two markings from points in a picture.
 
 Flat road, parallel markings: in the track frame at the car, a marking `d` m to the right lies at
 left = curvature * along^2 / 2 - d. Pixels of the whole picture: u right, v down.
@@ -20,12 +20,12 @@ CONVERGED = 1e-10
 DIFFERENCE = 1e-6  # step of the numerical derivatives
 MAX_PITCH_DEG = 30.0
 PITCHES_DEG = np.concatenate([[0.0], np.linspace(-4.0, 4.0, 33)])
-"""Starting points of the search for the pitch, degrees, around the pitch at which straight markings
-would meet."""
+"""Starting points of the search for the pitch, degrees, relative to the pitch at which straight
+markings would meet at the horizon."""
 LINE_ALONG_M = np.geomspace(1.5, 80.0, 80)
 FAR_HANDLE_M = 25.0
 MARGIN = 0.03
-"""Distance of handles from the edges of the picture, as a share of its sides."""
+"""Least distance of handles from the edges of the picture, as a share of its width or height."""
 
 
 class MarkingsError(UserError):
@@ -34,9 +34,9 @@ class MarkingsError(UserError):
 
 @dataclass(frozen=True)
 class Markings:
-    """The lane's markings at the car, m, negative to the left; angle, rad, positive where the car
-    points to the right; curvature, 1/m, positive to the left; pitch of the camera in this picture,
-    positive downwards."""
+    """The lane's markings at the car: distances ml and mr (m, negative to the left), angle (rad,
+    positive when the car points to the right), curvature (1/m, positive to the left), and the
+    camera's pitch in this picture (degrees, positive downwards)."""
 
     ml: float
     mr: float
@@ -52,11 +52,12 @@ def fit_markings(
     curvature: float | None = 0.0,
     pitch_deg: float | None = None,
 ) -> Markings:
-    """The markings through points (N, 2) of each, px of the camera's pictures.
+    """Fit the markings to points on the left and on the right marking, each (N, 2), px of the
+    camera's pictures, by least squares of the points' lateral distances, converted to px.
 
-    `curvature` None: it is fitted too, from a third point on either marking. `pitch_deg` None: the
-    pitch is fitted too, from the point where the markings would meet. Least squares of the points'
-    lateral distances, converted to px. Raises MarkingsError.
+    With `curvature` None the curvature is fitted too, from a third point on either marking. With
+    `pitch_deg` None the pitch is fitted too, from the point where the markings would meet. Raises
+    MarkingsError.
     """
     points = [np.asarray(side, np.float64).reshape(-1, 2) for side in (left, right)]
     if min(map(len, points)) < 2:
@@ -91,10 +92,11 @@ def _refine(
     free: NDArray[np.bool_],
     steps: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Sum of squares, px^2, and the values (5,) after those at the indices `free` were fitted.
+    """Fit the `values` (5,) in the mask `free` (5,) by the Levenberg-Marquardt method; returns the
+    sum of squares, px^2, and all values.
 
-    Uses the Levenberg-Marquardt method. The sum is infinite where a point is not on the road; a
-    search that starts with an infinite sum ends with one.
+    The sum is infinite if a point is not on the road; a search that starts with an infinite sum
+    ends with one. `sides` (N,): 0 for points on the left marking, 1 for the right.
     """
     names = np.flatnonzero(free)
     residual = _residuals(camera, pixels, sides, values)
@@ -132,8 +134,8 @@ def _residuals(
     sides: NDArray[np.int64],
     values: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Lateral distances (N,) of points from their marking, converted to px; infinite above the
-    horizon."""
+    """Return the lateral distances (N,) of the points `pixels` (N, 2) from their marking, converted
+    to px; infinite above the horizon."""
     ml, mr, angle, curvature, pitch = values.tolist()
     x, y = replace(camera, pitch_deg=pitch).road_points(pixels).T
     along = x * np.cos(angle) + y * np.sin(angle)
@@ -147,7 +149,7 @@ def _residuals(
 def _meeting_pitch(
     camera: CameraParameters, left: NDArray[np.float64], right: NDArray[np.float64]
 ) -> float:
-    """The pitch, degrees, at which the straight lines through both markings are level.
+    """Return the pitch (degrees) at which the straight lines through both markings are level.
 
     Each marking and the optical centre span a plane; both planes contain the road's direction
     (Hartley and Zisserman 2004, section 8.6).
@@ -174,7 +176,8 @@ def _meeting_pitch(
 def marking_pixels(
     camera: CameraParameters, markings: Markings, along: ArrayLike = LINE_ALONG_M
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (N, 2) of the left and the right marking, NaN where the camera does not see them."""
+    """Return the pixels (N, 2) of the left and of the right marking at the distances `along` (N,)
+    m along the road; NaN where the camera does not see them."""
     source = replace(camera, pitch_deg=markings.pitch_deg)
     found = []
     for distance in (markings.ml, markings.mr):
@@ -185,7 +188,7 @@ def marking_pixels(
 
 
 def handles(camera: CameraParameters, markings: Markings) -> dict[str, list[list[float]]]:
-    """For each side by name: the pixels of the near, the middle and the far handle.
+    """Return, for "left" and "right", the pixels [u, v] of the near, middle and far handle.
 
     Where a marking leaves the picture, its handles lie at the picture's edge.
     """

@@ -46,7 +46,8 @@ class LabelStd:
 
 
 def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
-    """The values of `--label-std 0.06,0.006 --label-std 'night_*=0.16,0.012'`. Raises UserError."""
+    """Parse texts such as "0.06,0.006" and "night_*=0.16,0.012", the values of --label-std. Raises
+    UserError."""
     found = []
     for text in texts:
         pattern, _, numbers = text.rpartition("=")
@@ -107,7 +108,8 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
 def _converted(
     folder: Path, row: dict[str, str], stds: Sequence[LabelStd]
 ) -> tuple[CameraParameters, Cells]:
-    """The level camera and the cells of a row. Raises UserError or ValueError."""
+    """Return the camera (without its pitch) and the cells of `labels.csv` for a row of the table.
+    Raises UserError or ValueError."""
     if not path_within(row["file"]):
         raise UserError(f"the file {row['file']!r} is not a path inside the table's folder")
     height, width = read_whole_image(folder / row["file"]).shape[:2]
@@ -124,7 +126,7 @@ def _converted(
         "file": row["file"],
         **lane_cells(-_number(row, "x_left_m"), -_number(row, "x_right_m")),
         "angle": f"{_number(row, 'heading_rad'):.6g}",
-        # A gentler bend may become sharper: the class looks 20 m ahead.
+        # A gentler bend can be sharper 20 m ahead, which also determines the class.
         "heading": bend if abs(curvature) >= BEND_CURVATURE else UNKNOWN,
         "drive": row.get("drive") or "",
         "light": row.get("light") or "",
@@ -153,7 +155,7 @@ def _write_camera(folder: Path, camera: CameraParameters, taken: set[str]) -> st
     """Write the file of a camera; returns its name within `folder`."""
     base = f"{CAMERAS}/{camera.width}x{camera.height}-{camera.fov_y_deg:g}deg"
     name, number = f"{base}.yaml", 2
-    while name in taken:  # another height
+    while name in taken:  # by a camera that differs only in its height
         name, number = f"{base}-{number}.yaml", number + 1
     (folder / CAMERAS).mkdir(exist_ok=True)
     write_camera(folder / name, camera, "The pitch of each picture is in labels.csv.")

@@ -50,8 +50,8 @@ MAX_BODY_BYTES = 64 << 10
 MAX_SHOWN_PX = 1600
 """Maximum of the longer side of a picture sent to the page, px."""
 USUAL_LANE = -1.8, 1.8, 0.0, 0.0
-"""Initial markings if there is no answer of the model: a lane of 3.6 m with the car in its
-middle."""
+"""Initial ml, mr (m), angle and curvature without an answer of the model: the car is in the middle
+of a lane of 3.6 m."""
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -64,20 +64,20 @@ Text = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
 
 
 class Drag(BaseModel):
-    """Handles of both markings, px of the whole picture."""
+    """The body of a request to fit markings: handles of both markings, px of the whole picture."""
 
     model_config = ConfigDict(extra="forbid")
 
     left: Pixels
     right: Pixels
     curvature: Number | None = 0.0
-    """Curvature, 1/m; None: fitted from a third point."""
+    """Curvature, 1/m; None: it is fitted from a third point."""
     pitch_deg: Number | None = None
-    """Pitch, degrees; None: fitted from where the markings meet."""
+    """Pitch, degrees; None: it is fitted from the point where the markings meet."""
 
 
 class Label(BaseModel):
-    """The label to save for a picture."""
+    """The body of a request to save a picture's label; m, rad, 1/m and degrees."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -95,13 +95,13 @@ class Labeller:
     """Answers of a model and labels made by hand, for the pictures of a folder."""
 
     def __init__(self, folder: LabelFolder, engine: Engine | None) -> None:
-        """`engine` None: there are no answers of a model."""
+        """Use the model of `engine`; with None there are no answers of a model."""
         self.folder = folder
         self._engine = engine
         self._lock = Lock()  # an engine takes one picture at a time
 
     def listing(self) -> dict[str, Any]:
-        """The pictures by number: name, and whether they are labelled."""
+        """Return the folder's name, and for each picture its name and whether it is labelled."""
         rows = self.folder.rows()
         files = [
             {"file": name_as_text(name), "labelled": name in rows} for name in self.folder.files
@@ -109,8 +109,8 @@ class Labeller:
         return {"folder": name_as_text(self.folder.folder.name), "pictures": files}
 
     def picture(self, number: int) -> dict[str, Any]:
-        """Size, row, lines and handles of a picture, from its label or else from the model's
-        answer."""
+        """Return size, row, lines and handles of a picture. The lines are those of its label; else
+        of the model's answer; else of the usual lane."""
         image = self.folder.picture(number)
         height, width = image.shape[:2]
         camera = self.folder.camera(number, width, height)
@@ -132,7 +132,7 @@ class Labeller:
     def _answer(
         self, image: np.ndarray[Any, Any], camera: CameraParameters
     ) -> tuple[Markings | None, str]:
-        """The model's answer, and a note about it."""
+        """Return the model's answer for a picture, None without one, and a note about it."""
         if self._engine is None:
             return None, ""
         lens = Rectification(camera, self._engine.card.camera)
@@ -150,7 +150,7 @@ class Labeller:
         return Markings(*sides, found.angle_rad, 0.0, camera.pitch_deg), note
 
     def shown_jpeg(self, number: int) -> bytes:
-        """The picture as JPEG, its longer side at most `MAX_SHOWN_PX`."""
+        """Return the picture as JPEG; its longer side is at most `MAX_SHOWN_PX` px."""
         image = self.folder.picture(number)
         scale = min(1.0, MAX_SHOWN_PX / max(image.shape[:2]))
         if scale < 1:
@@ -159,7 +159,7 @@ class Labeller:
         return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=90))
 
     def fit(self, number: int, drag: Drag) -> dict[str, Any]:
-        """The markings through dragged handles. Raises UserError."""
+        """Return the markings through the dragged handles, as `shown` does. Raises UserError."""
         height, width = self.folder.picture(number).shape[:2]
         camera = self.folder.camera(number, width, height)
         found = fit_markings(camera, drag.left, drag.right, drag.curvature, drag.pitch_deg)
@@ -167,7 +167,7 @@ class Labeller:
 
 
 def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:
-    """Markings as JSON: their values, and lines and handles in px of the picture."""
+    """Convert markings for JSON: their values, and lines and handles in px of the picture."""
     lines = {}
     for side, pixels in zip(("left", "right"), marking_pixels(camera, markings), strict=True):
         seen = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e5).all(1)]
@@ -176,7 +176,10 @@ def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:
 
 
 def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
-    """The page and its interface as an ASGI application."""
+    """Make the page and its interface as an ASGI application.
+
+    `names`: allowed Host and Origin names; `token`: None if requests need no token.
+    """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     last = len(labeller.folder.files) - 1
     number_type = Annotated[int, PathNumber(ge=0, le=last)]
@@ -238,7 +241,7 @@ def _page_file(path: Path) -> Callable[[], Response]:
 
 
 def _checked(app: Asgi, names: HostNames, token: str | None) -> Asgi:
-    """`app` behind the checks of every request."""
+    """Return `app` with a check of every request before it (`_refusal`)."""
 
     async def run(scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
@@ -286,7 +289,7 @@ def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) ->
     app = create_app(labeller, names, token)
     with locked_folder(labeller.folder.folder):
         listeners = bind_all(host, port)
-        for listener in listeners:  # the address is printed: from now on it answers
+        for listener in listeners:  # before the address is printed, so that it answers at once
             listener.listen()
         where = address(listeners[0], host)
         hint = "" if token is None else "#TOKEN"

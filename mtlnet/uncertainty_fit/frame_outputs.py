@@ -33,7 +33,7 @@ class FrameOutputs:
     An error is NaN where the label or, for `to_lane_centre`, the prediction is absent.
     """
 
-    x: NDArray[np.float32]  # (N, F) inputs of the standard deviations, the light included
+    x: NDArray[np.float32]  # (N, F) inputs of the uncertainty head, the last of them the light
     error: NDArray[np.float32]  # (N, D) m and rad
     texture: NDArray[np.float32]  # (N, T)
 
@@ -55,7 +55,8 @@ def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
 def _run_torch(
     network: Network, frames: Images, chosen: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The results of `_run_openvino` by torch in float32, on a GPU if there is one."""
+    """Return the same arrays as `_run_openvino`, computed by torch in float32, on a GPU if there is
+    one."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     module = FitInputs(copy.deepcopy(network)).eval().to(device)
     images = np.empty((CHUNK, HEIGHT, WIDTH, 3), np.uint8)
@@ -72,9 +73,10 @@ def _run_torch(
 def _run_openvino(
     network: Network, frames: Images, chosen: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Outputs of the network (N, 9), inputs of the head (N, F) and textures (N, T).
+    """Return the network's outputs (N, 9), the inputs of the head without the light (N, F) and the
+    textures (N, T) for the N `chosen` frames.
 
-    Computed with one request per core, which is three times as fast as torch in float32.
+    One OpenVINO request per core computes them, three times as fast as torch in float32.
     """
     x = np.empty((len(chosen), network.architecture.uncertainty_inputs), np.float32)
     outputs = np.empty((len(chosen), OUTPUTS), np.float32)
@@ -96,7 +98,7 @@ def _run_openvino(
 
 
 def _infer_queue(network: Network) -> Any:
-    """One request per core, each with one thread."""
+    """Return a queue of OpenVINO requests: one per core, each with one thread."""
     import openvino
 
     cores = os.cpu_count() or 1

@@ -1,6 +1,6 @@
 """Fits the standard deviations of the uncertainty head (`mtlnet.model.uncertainty_head`).
 
-A network's errors are smaller on frames of its training than on new ones. Therefore some train
+A network's errors are smaller on frames of its training than on new frames. Therefore some train
 rounds are held out of the training (`mtlnet.data.rounds.hold_out_rounds`); they determine the scale
 of the standard deviations and the limit of the out-of-distribution score.
 """
@@ -47,31 +47,33 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 FALSE_ALARM_RATE = 0.01
-"""Share of known frames classified as out of distribution: half of it by texture, half by pitch."""
+"""Share of frames of the training distribution that are classified as out of distribution: half of
+it by texture, half by pitch."""
 MAX_TRAIN_FRAMES, MAX_HELD_OUT_FRAMES = 3_000, 24_000
 HIDDEN = 32
 FIT = FitSettings(steps=1_000, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 8
 MIN_FRAMES_TO_DIVIDE = 8
-"""Without held-out frames, every second train frame sets the limits of what counts as known, if
-there are at least this many. With fewer, all of them do: otherwise half would count as
-unfamiliar."""
+"""Without held-out frames, every second train frame determines the limits of the
+out-of-distribution score, if there are at least this many train frames. With fewer, all train
+frames determine them, because otherwise half of these would be out of distribution."""
 MIN_PRESENT_FRAMES = 30  # least number of frames for a feature's own temperature
 MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
-"""Limits of a standard deviation, relative to the RMS error, which a few large errors determine."""
+"""Limits of a standard deviation, relative to the RMS error. The lower limit is small, because a
+few large errors determine the RMS error."""
 MIN_FEATURE_STD_SHARE = 0.1
 MIN_LIGHT_STD = np.repeat([0.1, 0.1, 0.1, 0.02, 0.02], HALVES)
 """Lower limits for the standard deviations of `light_features`: about half of their standard
-deviations over all lights. The images of a model of one scene vary less, but another scene must not
-be many standard deviations away."""
+deviations over all lights. The images of a training on one scene vary less, but another scene must
+not be many standard deviations away."""
 LOG_STD_LIMITS = (math.log(MIN_STD_SHARE), math.log(MAX_STD_SHARE))
 COVERED = (0.6827, 0.9545)
 """Shares of a normal distribution within one and two standard deviations."""
 FREEDOM = 3.0
 """Degrees of freedom of the Student t distribution that is fitted to the errors. Errors have
 outliers, which would determine the standard deviations under a normal distribution (Lange, Little
-and Taylor 1989). Within two standard deviations lay 90 to 93 % of the errors of test rounds, 85 to
-91 % with a normal distribution (docs/experiments/uncertainty.md)."""
+and Taylor 1989). On test rounds 90 to 93 % of the errors were within two standard deviations, with
+a normal distribution 85 to 91 % (docs/experiments/uncertainty.md)."""
 
 
 def fit_uncertainty_head(
@@ -84,8 +86,8 @@ def fit_uncertainty_head(
     """Fit the uncertainty head of `network` (folded) on its train frames and on held-out frames.
 
     Without held-out frames it is fitted on the train frames alone, and its standard deviations are
-    too small; the model card then lists no held-out rounds. In that case it does not read the
-    light, because that few rounds do not show enough sceneries.
+    too small; the model card then lists no held-out rounds. In that case the light is no input of
+    the head, because so few rounds do not show enough sceneries.
     """
     count = network.architecture.uncertainty_inputs
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)
@@ -144,7 +146,7 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
     UserError for a dataset with too few rounds.
     """
     card, dataset = read_card(run), open_training_dataset(data)
-    # All rounds are new to the model: the larger part determines the standard deviations.
+    # All rounds are new to the model, so the larger part takes the role of the held-out rounds.
     many, few = hold_out_rounds(dataset)
     if few is None:
         raise UserError(
@@ -173,12 +175,12 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
 def standardisation(
     x: NDArray[np.float32], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean (F,) and inverse standard deviation (F,) of inputs (N, F), for `standardise`.
+    """Return mean (F,) and inverse standard deviation (F,) of inputs `x` (N, F), for `standardise`.
 
     The first `count` inputs are the network's, the remaining inputs the light. The standard
-    deviation of a feature counts as at least `MIN_FEATURE_STD_SHARE` of the mean one: a unit that
-    is silent on these frames would otherwise be thousands of deviations away on other frames. The
-    standard deviation of the light counts as at least `MIN_LIGHT_STD`.
+    deviation of a network's input is raised to at least `MIN_FEATURE_STD_SHARE` of their mean
+    standard deviation: otherwise a unit that is 0 on these frames could be thousands of standard
+    deviations away on other frames. That of a light input is raised to at least `MIN_LIGHT_STD`.
     """
     std = x.std(0)
     floor = max(MIN_FEATURE_STD_SHARE * float(std[:count].mean()), 1e-3)
@@ -191,10 +193,11 @@ def fit_std_layers(
 ) -> dict[str, NDArray[np.float32]]:
     """Fit the layers that predict standard deviations; returns a part of `UncertaintyHead`'s state.
 
-    `z` (N, F): standardised features, `error` (N, D); `held_out`: frames with standardised `x`. The
-    layers are fitted on all frames. Temperature scaling (Guo et al. 2017) brings the shares of
-    errors within one and two standard deviations near `COVERED`, by cross-validation: each of
-    `FOLDS` parts of the held-out frames is predicted by layers fitted without it.
+    `z` (N, F): standardised inputs of the train frames, `error` (N, D): errors in m and rad;
+    `held_out`: held-out frames with standardised `x`. The layers are fitted on all frames.
+    Temperature scaling (Guo et al. 2017) brings the shares of errors within one and two standard
+    deviations near `COVERED`, by cross-validation: each of `FOLDS` parts of the held-out frames is
+    predicted by layers fitted without it.
     """
     first_judged = 0 if held_out is None else len(z)
     if held_out is not None:
@@ -224,7 +227,8 @@ def fit_std_layers(
 
 
 def _rms_error(error: NDArray[np.float32]) -> NDArray[np.float32]:
-    """RMS (D,) of errors (N, D); a quarter of the feature's range if it is never present."""
+    """Return the RMS (D,) of errors (N, D); for a feature that is never present, a quarter of its
+    range."""
     spans = [tf.RANGES[name if name in tf.RANGES else "m"] for name in FEATURES]
     absent = np.array([(span.hi - span.lo) / 4 for span in spans])
     present = ~np.isnan(error)
@@ -234,7 +238,8 @@ def _rms_error(error: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _temperatures(ratio: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Factors (D,) for the standard deviations, from ratios (N, D) of error to predicted deviation.
+    """Return factors (D,) for the predicted standard deviations, from the ratios (N, D) of the
+    errors to them.
 
     A feature present in fewer than `MIN_PRESENT_FRAMES` frames gets the median factor of the other
     features.
@@ -246,10 +251,11 @@ def _temperatures(ratio: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _temperature(ratio: NDArray[np.float32]) -> float:
-    """The factor that minimises the larger deviation of the two shares from `COVERED`.
+    """Return the factor that minimises the larger deviation of the two shares from `COVERED`, from
+    the ratios (N,) of one feature.
 
-    Because of outliers no factor gives both shares: one that gives the first gives too little of
-    the second.
+    Because of outliers no factor gives both shares: with the factor that gives the first share, the
+    second share is too small.
     """
     candidates = np.quantile(ratio, np.linspace(0.6, 0.9, 61))
     limits = np.outer([1.0, 2.0], candidates)
@@ -259,7 +265,8 @@ def _temperature(ratio: NDArray[np.float32]) -> float:
 
 
 def _train(z: Tensor, error: Tensor, seed: int) -> TwoLayers:
-    """Layers z (N, F) -> log scales (N, D) of the most likely t distributions of the errors."""
+    """Fit layers that compute, from inputs `z` (N, F), the logarithms (N, D) of the scales of the
+    errors' t distributions, by maximum likelihood."""
     generator = torch.Generator().manual_seed(seed)
     layers = _start_layers(z.shape[1], generator)
     present = (~error.isnan()).float()
@@ -279,7 +286,7 @@ def _train(z: Tensor, error: Tensor, seed: int) -> TwoLayers:
 
 
 def _start_layers(size: int, generator: torch.Generator) -> TwoLayers:
-    """Two layers whose result is 0, the logarithm of an error's RMS."""
+    """Make two layers whose initial result is 0: the predicted scale is the RMS of the errors."""
     layers = TwoLayers(size, HIDDEN, len(FEATURES))
     with torch.no_grad():
         layers.first.weight.normal_(0.0, size**-0.5, generator=generator)

@@ -6,8 +6,8 @@ by homographies, which are exact for a rotation about the optical centre (Hartle
 extrapolated border is visible.
 
 The field of view of these images varies too but is not predicted: on a straight flat road a wider
-view looks like that of a higher camera, except for the length of dashes. A field-of-view regressor
-was tried; it detected only 2 to 5 % of the frames.
+view looks like the view of a higher camera, except for the length of dashes. A regressor of the
+field of view was tried; it detected only 2 to 5 % of the frames.
 """
 
 from collections.abc import Callable, Iterable
@@ -34,20 +34,21 @@ from mtlnet.model.uncertainty_head import TwoLayers
 from trackfeatures.camera import CameraParameters
 
 MIN_SPREAD = 0.05
-"""Lower limit of a cell value's standard deviation, because cells may be flat in all training
-frames."""
+"""Lower limit of a texture value's standard deviation, because a cell of the image can be without
+texture in all training frames."""
 RIDGE = 0.02
 """Added to the variance along each principal axis of standardised textures, against overfitting."""
 MAX_PITCH_RAD, MAX_LOG_ZOOM = 0.26, 0.5
-"""Limits of the views: pitch (15 degrees); logarithm of the ratio of the tangents of half the field
-of view."""
+"""Limits of the random views: pitch (rad, 15 degrees), and logarithm of the ratio of the tangents
+of half the field of view."""
 PITCH_FRAMES, VIEWS_PER_FRAME = 1_500, 2
 CELL_NOISE = 1 / 255
 """Half a grey level. An image that differs by this much in each cell from training images that are
 all alike is not out of distribution."""
 PITCH_UNIT_RAD = 0.1  # unit of the regression target
 MIN_PITCH_LIMIT_RAD = 0.02
-"""Lower limit of the pitch that counts as out of distribution, for datasets of few frames."""
+"""A predicted pitch below this value (rad) is never out of distribution, even if the pitches of few
+frames vary less."""
 HIDDEN = 64
 
 
@@ -67,10 +68,11 @@ FIT = FitSettings(steps=800, batch=256, learning_rate=3e-3, weight_decay=0.1)
 def fit_texture_distance(
     known: NDArray[np.float32], held_out: NDArray[np.float32], false_alarm_rate: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean (C,) and directions (C, C) of the Mahalanobis distance of texture cell values (N, C).
+    """Return mean (C,) and directions (C, C) of the Mahalanobis distance of texture values (N, C),
+    fitted on the `known` frames.
 
-    Scaled so that a share `false_alarm_rate` of the held-out frames exceeds a squared distance of
-    1.
+    The directions are scaled so that the squared distance exceeds 1 in a share `false_alarm_rate`
+    of the held-out frames.
     """
     mean, spread = known.mean(0), np.maximum(known.std(0), MIN_SPREAD)
     covariance = np.cov((known - mean) / spread, rowvar=False, ddof=min(1, len(known) - 1))
@@ -84,8 +86,8 @@ def fit_texture_distance(
 
 
 def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw a pitch (rad, positive downwards) and a log zoom whose image centre lies in the
-    frame."""
+    """Return a random pitch (rad, positive downwards) and log zoom of a view whose image centre
+    lies within the frame."""
     while True:
         pitch = rng.uniform(-MAX_PITCH_RAD, MAX_PITCH_RAD)
         log_zoom = rng.uniform(-MAX_LOG_ZOOM, MAX_LOG_ZOOM)
@@ -94,7 +96,7 @@ def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float
 
 
 def view_homography(camera: CameraParameters, pitch: float, log_zoom: float) -> NDArray[np.float64]:
-    """Homography (3, 3) from pixels of `camera` to pixels of a camera with another view.
+    """Return the homography (3, 3) from pixels of `camera` to pixels of a camera with another view.
 
     The other camera is pitched down by `pitch` (rad) and sees exp(`log_zoom`) times as far to the
     sides.
@@ -122,8 +124,8 @@ def _centre_in_frame(camera: CameraParameters, pitch: float, log_zoom: float) ->
 def pitched_views(
     frames: Images, camera: CameraParameters, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Centre texture features (N, M) of frames seen at other pitches, and the pitches (N,), rad,
-    positive downwards."""
+    """Return the texture features (N, M) of the image centre for frames warped to other pitches,
+    and the pitches (N,), rad, positive downwards."""
     rng = np.random.default_rng([seed, 4])
     chosen = np.linspace(0, len(frames) - 1, min(PITCH_FRAMES, len(frames))).astype(np.int64)
     image = np.empty((1, camera.height, camera.width, 3), np.uint8)
@@ -154,8 +156,8 @@ def fit_pitch_offset(
     `UncertaintyHead`.
 
     `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: the
-    features from `pitched_views`, and their pitches. Scaled so that a share `false_alarm_rate` of
-    the held-out frames has an offset beyond 1.
+    result of `pitched_views`. The regressor's result is scaled so that its absolute value exceeds 1
+    in a share `false_alarm_rate` of the held-out frames.
     """
     x = np.concatenate([known, views[0]])
     target = np.concatenate([np.zeros(len(known), np.float32), views[1] / PITCH_UNIT_RAD])[:, None]
@@ -181,8 +183,8 @@ def fit_pitch_offset(
 
 
 def _train(z: Tensor, target: Tensor, seed: int) -> list[NDArray[np.float32]]:
-    """Weight, bias, weight and bias of two layers z (N, M) -> target (N, 1), fitted by smooth L1
-    loss."""
+    """Fit two layers from `z` (N, M) to `target` (N, 1) with the smooth L1 loss; returns weight and
+    bias of the first and of the second layer."""
     generator = torch.Generator().manual_seed(seed)
     layers = TwoLayers(z.shape[1], HIDDEN, 1)
     with torch.no_grad():
@@ -205,9 +207,8 @@ def minimise(
     settings: FitSettings,
     generator: torch.Generator,
 ) -> None:
-    """Minimise `loss(rows)` over random batches of rows of `count` samples.
-
-    Uses AdamW with a learning rate that falls to 0 along a cosine.
+    """Minimise `loss(rows)` over the `parameters`; `rows` (batch,) are random indices of `count`
+    samples. The optimiser is AdamW, with a learning rate that falls to 0 along a cosine.
     """
     optimizer = torch.optim.AdamW(
         parameters, settings.learning_rate, weight_decay=settings.weight_decay
