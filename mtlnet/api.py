@@ -83,7 +83,7 @@ class Options(TypedDict, total=False):
 
 
 class Model:
-    """A trained model. Safe to call from several threads; they take turns."""
+    """A trained model. Several threads can call it at once; it predicts one image at a time."""
 
     def __init__(
         self, run: Path, engine: str = "openvino", precision: str | None = None, threads: int = 1
@@ -122,7 +122,7 @@ class Model:
     ) -> Any:
         """Predict the features of one image, of a list of images, or of all images of a source.
 
-        `source`: an image file, the bytes of one or pixels (H, W, 3) uint8 RGB give `Features`; a
+        `source`: an image file, its bytes, or pixels (H, W, 3) uint8 RGB give `Features`; a
         list of these gives a list. A film, folder, pattern, recorded round, ROS 2 bag, webcam
         number or address of a stream (all as text, as for `mtlnet predict`) gives an iterator,
         which reads and predicts image by image. `camera`: a camera file or CameraParameters;

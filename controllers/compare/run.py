@@ -42,7 +42,7 @@ Progress = Callable[[float, int, str], None]
 the total number of drives, and the name of the present drive or controller. Several threads call
 it."""
 Report = Callable[[float, str], None]
-"""A function that is called with the first and the last argument of `Progress`."""
+"""A function that is called with the number of drives done and the name of the present drive."""
 Driven = dict[str, Any] | UserError
 """The result of a drive with its curves, or the error of a drive without a result."""
 

@@ -35,9 +35,10 @@ RUN_UP_S = 15.0
 EASE_OFF = 1.0  # m/s2 of demanded braking at which the throttle is closed
 FULL_BRAKING = 15.0  # m/s2 at full brake on asphalt
 LOST_SPEED, LOST_BRAKE = 5.0, 0.1
-"""Speed (m/s) to which the car slows down when the perception is lost, and its brake (0 to 1)."""
+"""When the perception is lost, the car slows down to LOST_SPEED (m/s) with the brake LOST_BRAKE (0
+to 1)."""
 REWARDS = ("paper", "quadratic")
-"""Names of `step_reward` and `quadratic_reward` of `simulator.env.reward`."""
+"""Names of the rewards `step_reward` and `quadratic_reward` of `simulator.env.reward`."""
 
 
 class Drivable(Protocol):

@@ -34,9 +34,9 @@ SIDE_FORCE_M2 = 4.5
 density, wind speed and driving speed is the side force."""
 AIR_DENSITY = CarParameters.air_density
 FRICTION = (0.8, 1.6)
-"""Range of the tyres' friction coefficient."""
+"""Range of the tyres' friction coefficient of a disturbed car."""
 SPREAD = 0.2
-"""Largest relative deviation of mass and tyre stiffness."""
+"""Largest relative deviation of a disturbed car's mass and tyre stiffness."""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ class RideArrays(NamedTuple):
     seen: FloatArray
     """(N, OBSERVED): the rows of `Observations` of the present step."""
     log: FloatArray
-    """(N, S + 1, LOG): a row for each control step; see LOG."""
+    """(N, S + 1, LOG): a row for each control step, with the columns LOG_OFFSET to LOG_AHEAD."""
     ended: NDArray[np.int64]
     """(N,): code of the end of each drive (`simulator.env.reward.ending_code`); 0 before its end.
     """

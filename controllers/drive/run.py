@@ -46,7 +46,8 @@ track's width."""
 TYPICAL_SPEED = 15.0  # m/s, slightly below the speed of gear 1 and THROTTLE on a flat road
 
 START_M, START_S = 5.0, 10.0
-"""A car did not start if its drive ended within START_M (m), or if it stood for START_S (s)."""
+"""A car did not start if it drove less than START_M (m) before its drive ended early, or less than
+START_M in START_S (s)."""
 
 Progress = Callable[[int, int], None]
 """A function that is called with the steps done and the total number of steps."""

@@ -35,7 +35,7 @@ class ActorCard:
     """The description of a trained actor and of its training."""
 
     state: str
-    """Name of the state's definition."""
+    """Name of the definition of the state vector."""
     parts: tuple[str, ...]
     """Names of the numbers of the state, in their order."""
     half_width_m: float

@@ -26,7 +26,7 @@ SPANS = (1, 4)
 spans contain more of the motion and no more of the noise."""
 LONGEST = max(SPANS)
 WINDOW, FEWEST = 200, 20
-"""Largest and least number of control steps that are compared."""
+"""Largest and least number of control steps whose residuals are compared."""
 SURE = 3.5
 """Number of standard errors by which a delay must explain the measurements better than any
 other."""

@@ -54,12 +54,12 @@ MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 def make_lqr_kalman(
     loop: LoopConfig, *, wheel_rate: float = WHEEL_RATE, **weights: float
 ) -> "LqrKalman":
-    """`LqrKalman` for a control loop; `weights` replace fields of its `LqrWeights`."""
+    """Make an `LqrKalman` for a control loop; `weights` replace fields of its `LqrWeights`."""
     return LqrKalman(loop.dt, replace(WEIGHTS, **weights), wheel_rate, loop.delay_s)
 
 
 def make_mpc_kalman(loop: LoopConfig, **weights: float) -> "MpcKalman":
-    """`MpcKalman` for a control loop; `weights` replace fields of its `MpcWeights`."""
+    """Make an `MpcKalman` for a control loop; `weights` replace fields of its `MpcWeights`."""
     return MpcKalman(loop.dt, replace(MPC_WEIGHTS, **weights), loop.delay_s)
 
 

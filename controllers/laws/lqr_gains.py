@@ -11,7 +11,8 @@ from controllers.laws.lateral_model import LateralModel, Matrix
 from runtime.jit import compiled
 
 SLOWEST_M_S, FASTEST_M_S, GRID_M_S = 3.0, 45.0, 2.0
-"""The grid of speeds. The model divides by the speed, so the gains are constant below the grid."""
+"""Limits and step of the grid of speeds. Below the grid the gains are constant, because the model
+divides by the speed."""
 
 
 @dataclass(frozen=True)

@@ -66,18 +66,18 @@ class MpcWeights:
 
 WEIGHTS_PAPER = MpcWeights(1.0, 1.0, 1.0)
 WEIGHTS_EXACT = MpcWeights(1.0, 3.0, 0.03)
-"""Tuned on the four scored tracks. With three times the weight on the offset the car begins to
-oscillate, because it turns more slowly than the kinematic model."""
+"""Weights tuned on the exact state of the four scored tracks. With three times the weight on the
+offset the car begins to oscillate, because it turns more slowly than the kinematic model."""
 WEIGHTS_PERCEIVED = MpcWeights(1.0, 20.0, 2.0)
 
 
 def make_mpc(loop: LoopConfig, **weights: float) -> "Mpc":
-    """`Mpc` for a control loop; `weights` replace fields of its `MpcWeights`."""
+    """Make an `Mpc` for a control loop; `weights` replace fields of its `MpcWeights`."""
     return Mpc(loop.dt, replace(_weights(loop), **weights))
 
 
 def make_mpc_preview(loop: LoopConfig, **weights: float) -> "Mpc":
-    """`Mpc` whose reference follows the curvature of the road just ahead."""
+    """Make an `Mpc` whose reference follows the curvature of the road just ahead."""
     return Mpc(loop.dt, replace(_weights(loop), **weights), preview=True)
 
 

@@ -24,7 +24,7 @@ class RlController:
     def __init__(self, actor: Actor, loop: LoopConfig = EXACT) -> None:
         self._actor, self._loop = actor, loop
         self._cars: list[RlController] = []
-        """The controllers of the cars of `update_batch`."""
+        """One controller for each car that `update_batch` steers."""
         self._states = StateBuilder(actor.definition, loop)
         self._farthest_m = FARTHEST_M if loop.noisy else math.inf
 

@@ -25,10 +25,10 @@ SETTLED_S, GAINING = 4.0, 1.5
 """The speed error counts after the road has been free for SETTLED_S (s) plus the time to reach the
 set-point at an acceleration of GAINING (m/s2)."""
 NEW_BEND_RADIUS_M, NEW_BEND_S = 60.0, 2.0
-"""Assumed radius of a bend for the first NEW_BEND_S (s) after the class of the road announces it;
-then the curvature measured by the car decides."""
+"""Assumed radius (m) of a bend for the first NEW_BEND_S (s) after the class of the road announces
+the bend. From then on the curvature is estimated from the car's motion."""
 CLASS_FILTER_S = 0.15
-"""Time constant of the low-pass filter on the class, so that one wrong answer does not brake."""
+"""Time constant (s) of the low-pass filter on the class, so that one wrong answer has no effect."""
 
 AllowedSpeed = Callable[[CarState, Perceived], float]
 """A function that returns the speed (m/s) that the road allows; inf for no limit."""

@@ -35,7 +35,7 @@ def make_torcs(loop: LoopConfig) -> "StateFeedback":
 
 
 class StateFeedback(BatchController):
-    """Steers by the formula at the top of this module."""
+    """Steers by constant gains on offset, its rate, heading error and yaw rate (see the module)."""
 
     def update_batch(self, observations: Observations) -> Matrix:
         return feed_back(observations.rows)

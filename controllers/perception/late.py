@@ -107,8 +107,8 @@ class RoadEstimate:
         return self._trust.correct(known, arrived, steps, steps * self.dt * speed)
 
     def present(self, due: int) -> Perceived:
-        """Return the road at this step. An answer to an image of `due` steps ago is not late, so
-        `lost_s` counts the time from then on."""
+        """Return the estimate of the road at this control step. An answer is due `due` steps after
+        its image; `lost_s` is the time for which answers have been overdue or untrusted."""
         waited_s = max(self._age - due, 0) * self.dt
         if self._last is None or waited_s > LOST_S:
             return Perceived(None, 0.0, self._heading, None, lost_s=waited_s)

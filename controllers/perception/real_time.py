@@ -57,7 +57,7 @@ class AnswerSource(Protocol[Request, Answer]):
         """The answers received since the last call, oldest first."""
 
     def close(self) -> None:
-        """Release what the source holds open."""
+        """End the source's thread, if it has one."""
 
 
 class ImmediateAnswers(Generic[Answer]):
@@ -79,7 +79,7 @@ class ImmediateAnswers(Generic[Answer]):
         return answers
 
     def close(self) -> None:
-        """Do nothing: the source holds nothing open."""
+        """Do nothing: the source has no thread."""
 
 
 class RequestThread(Generic[Frame, Answer]):

@@ -48,7 +48,8 @@ class Algorithm:
     """Whether episodes have 400 steps from a random position and speed; the paper's episodes have
     6500 steps."""
     mirrored: bool = False
-    """Whether left and right are exchanged in half of the transitions, and the actor is odd."""
+    """Whether left and right are exchanged in half of the transitions, and the actor's action
+    changes its sign when they are exchanged in the state."""
     scaled: bool = False
     """Whether the networks' inputs are divided by their typical spread."""
     reward_baseline: float = 0.0

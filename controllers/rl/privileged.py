@@ -59,8 +59,8 @@ def privileged_state(
 ) -> NDArray[np.float32]:
     """Return the privileged states (N, SIZE) of the cars of `fleet`, divided by SPREAD.
 
-    The arguments are arrays (N,): `throttle` in [0, 1], `delay` in control steps, and `noise`, its
-    standard deviation as a share of the largest one.
+    The arguments are arrays (N,): `throttle` in [0, 1], `delay` in control steps, and `noise`, the
+    standard deviation of the perception's noise as a share of its largest value.
     """
     found = np.zeros((len(fleet.cars), SIZE), np.float32)
     cars, _, _, tables, _, _, roads, _, _ = fleet.arrays

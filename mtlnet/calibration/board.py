@@ -248,8 +248,8 @@ def _projection(fisheye: bool) -> Callable[..., Any]:
 
 
 def _usual(pairs: list[tuple[Corners, Corners]], size: tuple[int, int]) -> Any:
-    """Fit a usual lens; returns error in px, camera matrix, coefficients, rotations and
-    translations of the boards, and standard deviation of fy in px."""
+    """Fit a lens with OpenCV's usual distortion; returns error in px, camera matrix, coefficients,
+    rotations and translations of the boards, and standard deviation of fy in px."""
     flags = cv2.CALIB_FIX_K3 if len(pairs) < FEW else 0
     boards, corners = ([pair[k] for pair in pairs] for k in range(2))
     *found, deviations, _, _ = cv2.calibrateCameraExtended(

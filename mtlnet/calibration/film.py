@@ -34,7 +34,7 @@ LANE_WIDTHS_M = (2.0, 6.0)
 SAMPLE_S = 0.2
 """Time between the pictures whose markings are used, s."""
 FOLLOW_S = (0.09, 0.25)
-"""Limits of the time between two pictures in which points are followed, s."""
+"""Least and largest time between two pictures between which points are followed, s."""
 KEPT = 600
 """Maximum number of pictures that are kept; for a stream these are the latest two minutes."""
 FIRST_LOOK = 25
@@ -225,7 +225,7 @@ class DriveCalibration:
 
 
 def check_lane_width(lane_width_m: float | None) -> None:
-    """Raise UserError for a width that no lane has."""
+    """Raise UserError for a lane width outside `LANE_WIDTHS_M`; None is allowed."""
     low, high = LANE_WIDTHS_M
     if lane_width_m is not None and not low <= lane_width_m <= high:
         raise UserError(f"--lane-width {lane_width_m:g} m; give {low:g} to {high:g} m")

@@ -24,7 +24,7 @@ from runtime.svg_charts import MAX_POINTS, Line, Plot, line_plot, reliability_di
 
 FILE_NAME = "report.html"
 MAX_ROUNDS = 8
-"""Maximum number of rounds drawn along the track."""
+"""Maximum number of rounds whose offset and angle are drawn along the track."""
 HEAVY_SHADOW = 0.3
 """Intervals of a plot in which at least this share of the road is in shadow are shaded."""
 UNITS = {name: "rad" if name == "angle" else "m" for name in FEATURES}

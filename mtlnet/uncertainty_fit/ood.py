@@ -54,7 +54,7 @@ HIDDEN = 64
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of the training of a small regressor; see `minimise`."""
+    """Settings of the training of a small regressor with AdamW: `steps` batches of `batch` rows."""
 
     steps: int
     batch: int
