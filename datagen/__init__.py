@@ -1,1 +1,1 @@
-"""The dataset generator: a scripted AI driver records labelled rounds to MCAP."""
+"""Generates datasets: a scripted driver drives in the simulator; each drive is one MCAP file."""

@@ -1,4 +1,4 @@
-"""`python -m datagen`."""
+"""Runs the command `datagen` for `python -m datagen`."""
 
 from datagen.cli import main
 

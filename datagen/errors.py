@@ -1,7 +1,7 @@
-"""Errors of a collection; `datagen.recording.errors` has the errors of the dataset format."""
+"""Errors of `datagen collect`; `datagen.recording.errors` has the errors of the dataset format."""
 
 from trackfeatures.errors import UserError
 
 
 class RoundFailed(UserError):
-    """The driver cannot complete this round. Another attempt would fail in the same way."""
+    """The driver cannot complete a round. Another attempt would fail in the same way."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     ClassShares = dict[str, dict[str, float]]
 
 DEFAULT_LANES = ",".join(map(str, CollectConfig.lanes))
-PIPE_WIDTH = 120  # characters, for tables where stdout is no terminal
+PIPE_WIDTH = 120  # characters: width of tables if stdout is no terminal
 
 Out = Annotated[
     Path | None,
@@ -145,7 +145,10 @@ def record_plan(
     shard: "Shard | None",
     make_law: "MakeLaw | None" = None,
 ) -> "CollectResult":
-    """Record with a progress bar; exits with code 130 after Ctrl-C."""
+    """Record the plan, or its part `shard`, into `folder`, and show a progress bar.
+
+    `classes`: forecast shares for the table above the bar. Exits with code 130 after Ctrl-C.
+    """
     from datagen.execution.collect import collect as run
     from datagen.execution.progress import progress_bar
     from datagen.planning.summary import overview
@@ -185,12 +188,12 @@ def merge(
 
 
 def names(text: str) -> tuple[str, ...]:
-    """The names in a list separated by commas."""
+    """The names in a text of names separated by commas; empty names are left out."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """The lane counts in the text of --lanes. Raises UserError."""
+    """The lane counts in the text of --lanes, sorted. Raises UserError for other text."""
     try:
         return tuple(sorted({int(part) for part in names(text)}))
     except ValueError as error:

@@ -138,7 +138,7 @@ def view(
 
 
 def _info_text(statistics: dict[str, Any]) -> str:
-    """The result of `datagen.recording.statistics.describe` as text."""
+    """Format the result of `datagen.recording.statistics.describe` as lines of text."""
     lines = [f"{statistics['rounds']} rounds, {statistics['frames']} frames"]
     for name in ("track", "lanes", "light", "traffic", "trajectory"):
         counts = statistics[f"by_{name}"]

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 Level = Annotated[
     str,
     typer.Option(
-        help="Checks: quick, the end of each file and its message counts; full, every byte; "
-        "deep, also every image and label."
+        help="quick checks the end of each file and its message counts; full checks every byte; "
+        "deep also decodes every image and label."
     ),
 ]
 Replay = Annotated[
-    int, typer.Option(help="Simulate this many rounds again: their labels must be bit-equal.")
+    int, typer.Option(help="Number of rounds to simulate again; their labels must be bit-equal.")
 ]
 Pixels = Annotated[
     bool, typer.Option("--pixels", help="With --replay: compare images too, on the same renderer.")
@@ -104,7 +104,7 @@ def split(
     name: Annotated[str, typer.Option(help="Name of the split: splits/NAME.json.")] = "default",
     by: Annotated[
         str,
-        typer.Option(help="Create the split by round, or by track (tests whole tracks)."),
+        typer.Option(help="Create the split: by round, or by track (no track is on two sides)."),
     ] = "",
     test_share: Annotated[
         float, typer.Option(help="With --by: share of rounds for testing.")
@@ -116,15 +116,16 @@ def split(
     near: Annotated[
         str,
         typer.Option(
-            help="Tolerances of near-duplicates: m along and across the road, deg of yaw."
+            help="Tolerances of near-duplicates: m along the road, m across it, deg of yaw."
         ),
     ] = "0.5,0.1,0.5",
     as_json: AsJson = False,
 ) -> None:
-    """Check a split, or create one with --by: no round, seed or content may be on two sides.
+    """Check a split, or create one with --by. No round, seed or content may be on two sides.
 
-    Counts the frames with a near-duplicate in train: same road and light, similar position, offset
-    and yaw. A split that leaks is refused; an existing split is not overwritten.
+    The command counts test and unseen frames with a near-duplicate in train: a frame of the same
+    road and light with a similar position, offset and yaw. A split that leaks is refused; an
+    existing split is not overwritten.
     """
     from datagen.recording.split_report import SplitConfig, check_split, format_report, make_split
 

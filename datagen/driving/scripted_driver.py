@@ -1,4 +1,4 @@
-"""The scripted driver: follows the course of its round, keeps its distance, and overtakes.
+"""The scripted driver: it follows the course of its round, keeps a distance to cars and overtakes.
 
 `simulator.driving.lateral_law` computes the steering along the course. Track frame, left positive.
 """
@@ -17,13 +17,13 @@ from simulator.vehicle.state import CarState, Command
 
 NATURAL_FREQUENCY = 2.2  # rad/s of the lateral motion
 DAMPING = 0.85
-MAX_LATERAL_SPEED = 2.4  # m/s, of the target point
-MAX_PATH_ANGLE = 0.16  # rad to the road
+MAX_LATERAL_SPEED = 2.4  # m/s, of the target offset
+MAX_PATH_ANGLE = 0.16  # rad, between the path and the road
 LANE_CHANGE_SPEED = 1.4  # m/s sideways, at most
 LANE_CHANGE_RESPONSE = 1.0  # 1/s
 PASSING_DISTANCE_M = 2.4  # lateral, between the centres of cars side by side
 LANE_CHANGE_PAUSE_S = 4.0
-SLOWER_BY = 1.5  # m/s: a leader this much slower is overtaken
+SLOWER_BY = 1.5  # m/s: a car ahead is overtaken if it is slower than the target speed by this much
 
 
 class SteeringLaw(Protocol):
@@ -35,14 +35,15 @@ class SteeringLaw(Protocol):
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
-        """The steering action in [-1, 1] towards a path, as `LateralLaw.steer`."""
+        """Steering action in [-1, 1], left positive, towards a path at `offset` (m from the track's
+        centre, left positive) with `curvature` (1/m) and `path_angle` (rad) to the road."""
 
     def restart(self) -> None:
-        """Forget the past: the car was put back onto the road."""
+        """Clear the state of the law, because the car was put back onto the road."""
 
 
 class ScriptedDriver:
-    """The driver of one round. Deterministic: everything random is in the course."""
+    """The driver of one round. It is deterministic; only its course has random values."""
 
     def __init__(
         self,
@@ -53,7 +54,7 @@ class ScriptedDriver:
         *,
         law: SteeringLaw | None = None,
     ) -> None:
-        """`speed` in m/s, where road and traffic allow it. `law` replaces the default law."""
+        """`speed` (m/s) is kept where road and traffic allow it. `law` replaces the default law."""
         car = CarParameters()
         self._road = road
         self._course = course
@@ -76,16 +77,16 @@ class ScriptedDriver:
         self._steered_for: float | None = None
 
     def offset_at(self, driven_m: float) -> float:
-        """Offset (m) of the course after `driven_m`."""
+        """Offset of the course in m after `driven_m` metres of the round."""
         return self._course.at(driven_m)[0]
 
     def speed_at(self, s: float) -> float:
-        """Target speed (m/s) at `s` (m)."""
+        """Target speed in m/s at the position `s` (m) on the lap."""
         return self._profile.at(s)
 
     def command(self, state: CarState, traffic: Traffic, driven_m: float) -> Command:
-        """The command for one control step; `driven_m` counts from the start of the round and
-        continues after resets."""
+        """The command for one control step. `driven_m` is the distance since the start of the
+        round; resets do not set it back."""
         if traffic.count:
             self._choose_lane(state, traffic, driven_m)
         shift_speed = self._step_shift()
@@ -113,7 +114,8 @@ class ScriptedDriver:
         return self._steered_for
 
     def _choose_lane(self, state: CarState, traffic: Traffic, driven_m: float) -> None:
-        """Start a lane change when the car ahead is slow and a lane beside is free."""
+        """Start a lane change when the car ahead is slow and a neighbouring lane is free, and
+        return to the course's lane when there is no car close ahead."""
         self._pause_s = max(self._pause_s - self._dt, 0.0)
         road = self._road
         leader = traffic.leader(state.s, state.to_middle)
@@ -136,15 +138,15 @@ class ScriptedDriver:
                 return
 
     def _step_shift(self) -> float:
-        """Advance the lane change by one step; returns its lateral speed (m/s)."""
+        """Advance the lane change by one control step; return its lateral speed (m/s)."""
         speed = LANE_CHANGE_RESPONSE * (self._shift_target - self._shift)
         speed = min(max(speed, -LANE_CHANGE_SPEED), LANE_CHANGE_SPEED)
         self._shift += speed * self._dt
         return speed
 
     def _avoid_cars(self, wanted: float, state: CarState, traffic: Traffic) -> tuple[float, bool]:
-        """The offset `wanted` (m), limited to the part of the road that is clear of cars alongside;
-        and whether the limits left it unchanged."""
+        """Limit the offset `wanted` (m) to the part of the road without cars alongside. Returns the
+        limited offset, and whether it equals `wanted`."""
         low, high = -self._max_offset, self._max_offset
         length = self._road.track.length_m
         near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)

@@ -1,4 +1,5 @@
-"""The lateral course of a round: an offset for each metre driven, in m, left positive.
+"""The course of a round: the car's target offset from the track's centre (m, left positive) at each
+metre driven.
 
 The data must cover the whole width of the road and all small angles to it. Each kind of trajectory
 covers them differently; a slow random wobble is added to every kind.
@@ -18,29 +19,29 @@ FloatArray = NDArray[np.float64]
 
 TRAJECTORIES = ("lane", "offsets", "weave", "lane-changes", "yaw-recoveries", "offset-recoveries")
 OUTSIDE_M = 1.0
-"""Largest distance of a course outside an outer marking."""
+"""Largest distance by which a course lies outside the outermost marking."""
 BODY_HALF_WIDTH_M = 0.97
 WALL_CLEARANCE_M = 0.75
 EDGE_CLEARANCE_M = 0.7
 MAX_OFFSET_STEP_M = 4.5
-"""Largest change between two offsets, so that the angle to the road stays small."""
+"""Largest change from one offset to the next; with it the angle to the road stays small."""
 WOBBLE_ANGLE_RAD = 0.024
 """Standard deviation of the wobble's angle to the road."""
 MIDDLE_WOBBLE = 0.5
-"""Factor on the wobble for the trajectory MIDDLE: the mean distance to the middle is then 0.17 m.
-The paper's vehicles drive at 0.148 and 0.175 m on their images."""
+"""Factor on the wobble for the trajectory MIDDLE. With it the mean distance to the middle is 0.17
+m; the paper's vehicles, which drive on their images, have 0.148 and 0.175 m."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Offset, slope and curvature at each metre driven. After its end the course repeats."""
+    """A course: offset, slope and curvature (N,) at each metre; it repeats after N metres."""
 
     offset: FloatArray  # m
     slope: FloatArray  # m per m
     curvature: FloatArray  # 1/m, relative to the road
 
     def at(self, driven_m: float) -> tuple[float, float, float]:
-        """Offset (m), slope and curvature (1/m) after `driven_m`, linearly interpolated."""
+        """Offset (m), slope (m/m) and curvature (1/m) after `driven_m` metres, interpolated."""
         count = len(self.offset)
         cell = int(driven_m)
         part = driven_m - cell
@@ -62,7 +63,7 @@ def max_offset(road: Road) -> float:
 
 
 def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator) -> Course:
-    """A course of `kind` (MIDDLE or one of TRAJECTORIES), at least `length_m` long.
+    """A random course of `kind` (MIDDLE or one of TRAJECTORIES), at least `length_m` metres long.
 
     Raises UserError for another kind.
     """
@@ -81,14 +82,14 @@ def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator
 
 
 def _lane(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """One lane, at a small constant offset from its centre."""
+    """A course in one lane, at a small constant offset from its centre."""
     lane = int(rng.integers(road.lanes))
     centre = tf.lane_centre(lane, road.lanes, road.lane_width)
     return np.full(count, centre + rng.normal(0.0, 0.4)), 1.0
 
 
 def _middle(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """The centre of the middle lane, as the paper's vehicle drives; only the wobble is added."""
+    """A course in the centre of the middle lane, as the paper's vehicle drives."""
     return np.full(count, tf.lane_centre(road.lanes // 2, road.lanes, road.lane_width)), 1.0
 
 
@@ -124,7 +125,7 @@ def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray
 
 
 def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A lane change every 50 to 130 m; on one lane, from one side of it to the other."""
+    """A lane change every 50 to 130 m; on a one-lane road, a change of side within the lane."""
     centres = np.array([tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes)])
     if road.lanes == 1:
         centres = np.array([-1.1, 1.1])
@@ -139,7 +140,7 @@ def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[Flo
 
 
 def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A lane; every 40 to 90 m a fast turn away from it and a slow return."""
+    """A course in one lane that turns away quickly every 40 to 90 m and returns slowly."""
     base, _ = _lane(road, count, rng)
     metres = np.arange(count, dtype=np.float64)
     at = rng.uniform(20.0, 60.0)
@@ -156,7 +157,8 @@ def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[F
 def _offset_recoveries(
     road: Road, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, float]:
-    """A lane; every 60 to 110 m the course is shifted by 1 to 2.4 m for some metres and returns."""
+    """A course in one lane that is shifted by 1 to 2.4 m every 60 to 110 m and returns after 6 to
+    18 m."""
     base, _ = _lane(road, count, rng)
     at = rng.uniform(20.0, 60.0)
     while at < count:
@@ -170,6 +172,7 @@ def _offset_recoveries(
 
 
 Maker = Callable[[Road, int, np.random.Generator], tuple[FloatArray, float]]
+"""Returns a course's offsets (count,) in m, and the standard deviation (m) of their smoothing."""
 _MAKERS: dict[str, Maker] = {
     MIDDLE: _middle,
     "lane": _lane,
@@ -187,7 +190,8 @@ def _steps(
     next_offset: Callable[[], float],
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Piecewise constant offsets with lengths drawn from `apart_m`, to be smoothed."""
+    """Piecewise constant offsets (count,) in m, before smoothing. `next_offset` gives each value;
+    its length is random between the two limits `apart_m`."""
     offset = np.empty(count)
     at = 0
     while at < count:
@@ -198,19 +202,21 @@ def _steps(
 
 
 def _wobble(count: int, rng: np.random.Generator) -> FloatArray:
-    """Slow random drift of the offset, m, like that of an inattentive driver."""
+    """Slow random drift (count,) of the offset in m, as of an inattentive driver."""
     noise = _noise(count, 9.0, rng)
     return noise * (WOBBLE_ANGLE_RAD / max(float(np.gradient(noise).std()), 1e-9))
 
 
 def _noise(count: int, length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Noise of unit standard deviation, correlated over about `length_m`."""
+    """Noise (count,) with standard deviation 1, one value per metre, correlated over about
+    `length_m` metres."""
     noise = _smooth(rng.normal(size=count + 64), length_m)[:count]
     return noise / max(float(noise.std()), 1e-9)
 
 
 def _smooth(values: FloatArray, deviation_m: float) -> FloatArray:
-    """Gaussian filter along the course; the end values continue beyond the ends."""
+    """Smooth `values` (N,), one per metre, with a Gaussian of standard deviation `deviation_m`. The
+    first and last value continue beyond the ends."""
     half = int(np.ceil(4.0 * deviation_m))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / deviation_m) ** 2)
     padded = np.pad(values, half, mode="edge")

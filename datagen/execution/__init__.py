@@ -1,1 +1,1 @@
-"""Collecting: processes or a Ray cluster that record a plan's rounds, locks, retries, merging."""
+"""Runs a collection: processes or a Ray cluster record the rounds of a plan. Merges datasets."""

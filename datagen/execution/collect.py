@@ -42,13 +42,14 @@ PLAN_FILE = "plan.json"
 
 
 class Executor(Protocol):
-    """Records rounds; see `ProcessPool.run`."""
+    """Records the rounds of `jobs` and returns those that failed (`ProcessPool`, `RayPool`)."""
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]: ...
 
 
 def make_pool(executor: str, workers: int, on_message: OnMessage) -> Executor:
-    """Processes on this machine, or actors on a Ray cluster. Raises UserError for other names."""
+    """Create the executor: processes on this machine ("local") or actors on a Ray cluster ("ray").
+    `workers` 0: one per core. Raises UserError for other values."""
     if workers < 0:
         raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for all cores")
     if executor not in EXECUTORS:
@@ -73,10 +74,10 @@ def collect(
 ) -> CollectResult:
     """Record the missing rounds of the plan, or of its part `shard`, into `folder`.
 
-    `make_law` makes a law in place of the scripted driver's; the plan's `driver` names it.
+    `make_law` makes the law that replaces the scripted driver's; the plan's `driver` names it.
 
-    Raises DatasetError when the folder has other contents or rounds failed, and the recording's
-    UserError or OSError. In all cases finished rounds stay and unfinished ones are removed.
+    Raises DatasetError if the folder has other contents or rounds failed, and UserError or OSError
+    of the recording. In all cases finished rounds stay and unfinished rounds are removed.
     """
     started = time.perf_counter()
     rounds = plan.rounds if shard is None else shard.select(plan.rounds)
@@ -105,10 +106,10 @@ def collect(
 
 
 def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
-    """Write manifest, split, statistics, card of the finished rounds; returns the dataset's hash.
+    """Write manifest, split, statistics and card of the finished rounds; return the dataset's hash.
 
-    With shards, only the last shard to end does this, since all rounds exist then; the function
-    returns None in the other shards.
+    If `shard` is given and rounds of the plan are still missing, nothing is written and the result
+    is None: the shard that ends last writes the files.
     """
     with setup_lock(folder):
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
@@ -130,7 +131,7 @@ def _failure_message(failures: Sequence[Failure], planned: int) -> str:
 
 
 def _remove_leftovers(folder: Path, rounds: Sequence[RoundPlan]) -> None:
-    """Delete unfinished files of these rounds, left by interruptions."""
+    """Delete the unfinished files of these rounds that interruptions have left."""
     discard_partials(folder, (entry.id for entry in rounds))
     states = read_states(folder)
     for entry in rounds:
@@ -140,7 +141,7 @@ def _remove_leftovers(folder: Path, rounds: Sequence[RoundPlan]) -> None:
 
 @contextmanager
 def _sigterm_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C."""
+    """Make SIGTERM raise KeyboardInterrupt within the block, as Ctrl-C does."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -149,7 +150,7 @@ def _sigterm_as_interrupt() -> Iterator[None]:
 
 
 def require_matching_folder(folder: Path, plan: Plan) -> None:
-    """Raise DatasetError unless `folder` is new, empty, or an unfinished dataset of `plan`.
+    """Raise DatasetError unless `folder` is missing, empty, or a dataset of `plan`.
 
     Raises DefinitionsMismatch for a dataset of other definitions.
     """
@@ -199,7 +200,7 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
 
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
-    """Text that lists the options that differ."""
+    """List the options and the driver that differ between the plan in the folder and `plan`."""
     found = LATER | found
     wanted = json.loads(json.dumps(LATER | plan.config.as_dict()))
     named = [
@@ -223,7 +224,7 @@ def _short(value: Any) -> str:
 
 
 def initialise_folder(folder: Path, plan: Plan) -> None:
-    """Write plan and split and create the subfolders."""
+    """Write the plan and the split into `folder` and create its subfolders."""
     # The plan is written first: with it, the same command can continue after any later failure.
     write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)

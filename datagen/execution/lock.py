@@ -1,4 +1,4 @@
-"""Locks of a dataset folder: one collector may write to it, or one for each shard of a plan.
+"""Locks a dataset folder: only one collector can write to it, or one for each shard of a plan.
 
 The locks are `flock` locks on files in `.locks/`. The operating system releases them when the
 process ends, however it ends. On Linux they also work over NFS.
@@ -20,7 +20,8 @@ FOLDER_LOCK, SETUP_LOCK = "folder", "setting-up"
 
 @contextmanager
 def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
-    """Lock the folder, or its part `shard`. Raises DatasetError when another collector holds it."""
+    """Lock the folder within the block; with `shard` only this shard. Raises DatasetError if
+    another collector holds the lock."""
     (folder / LOCKS).mkdir(exist_ok=True)
     with _open(folder, FOLDER_LOCK) as descriptor:
         if not try_lock(descriptor, shared=shard is not None):
@@ -44,14 +45,16 @@ def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
 
 @contextmanager
 def setup_lock(folder: Path) -> Iterator[None]:
-    """Lock the files that all shards write; waits while another collector holds the lock."""
+    """Lock the files that all shards write (plan, split, manifest) within the block. Waits while
+    another collector holds the lock."""
     with _open(folder, SETUP_LOCK) as descriptor:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
 
 
 def _require_same_count(folder: Path, shard: Shard) -> None:
-    """Raise DatasetError while shards of another count run: both would record the same rounds."""
+    """Raise DatasetError if a collector records a shard of another number of shards: both would
+    record the same rounds."""
     for path in sorted((folder / LOCKS).glob("shard-*-of-*")):
         if path.name.endswith(f"-of-{shard.count}"):
             continue

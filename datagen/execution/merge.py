@@ -1,4 +1,4 @@
-"""Merges folders of recorded rounds: shards of one plan, or plans whose rounds have other names."""
+"""Merges dataset folders: shards of one plan, or plans that share no round id and no seed."""
 
 import hashlib
 import json
@@ -36,7 +36,8 @@ from runtime.files import file_hash
 
 @dataclass(frozen=True, slots=True)
 class MergeResult:
-    """`rounds` of the `planned` rounds are in the folder now; this merge added `added`."""
+    """Result of a merge: `rounds` of the `planned` rounds are in the folder `out` now; `added` of
+    them were copied by this merge. `frames` counts all frames in `out`."""
 
     rounds: int
     planned: int
@@ -86,7 +87,7 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
 def _copy_rounds(
     found: Mapping[str, tuple[Path, RoundState]], round_ids: Sequence[str], out: Path
 ) -> None:
-    """Copy these rounds. Readers refuse the dataset until its split lists them."""
+    """Copy these rounds into `out`. Readers refuse the dataset until its split lists them."""
     if round_ids:
         begin_merge(out)
     for round_id in round_ids:
@@ -94,7 +95,8 @@ def _copy_rounds(
 
 
 def _derive(out: Path, planned: Mapping[str, str]) -> tuple[dict[str, RoundState], dict[str, Any]]:
-    """Write split, statistics, card and manifest; returns finished rounds and statistics."""
+    """Write split, statistics, card and manifest of the finished rounds in `out`; return the states
+    of these rounds and the statistics."""
     states = {i: state for i, state in read_states(out).items() if i in planned}
     if not states:
         end_merge(out)
@@ -119,9 +121,10 @@ def _read_plan(folder: Path) -> dict[str, Any]:
 
 
 def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
-    """The common plan of shards, or a plan of all rounds if no two share a name or a seed.
+    """The common plan of shards; for different plans, a plan of all their rounds.
 
-    With a shared seed, the same road in the same scenery could be in training and in test.
+    Raises DatasetError if different plans share a round id or a seed. With a shared seed, the same
+    road in the same scenery could be in training and in test.
     """
     parts = {plan["hash"]: plan for plan in plans}
     if len(parts) == 1:

@@ -1,4 +1,4 @@
-"""Records rounds in several processes. If one ends or hangs, its round is attempted again."""
+"""Records rounds in several processes. If a process ends or hangs, its round is tried again."""
 
 import multiprocessing
 import os
@@ -14,7 +14,7 @@ from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
 from datagen.recorder.job import FramesDone, Job, Message, worker_main
 from runtime.worker_threads import thread_limits
 
-STOP_S = 5.0  # s: for a process to end, before it is killed
+STOP_S = 5.0  # s: time that a process has to end before it is killed
 CONTEXT = multiprocessing.get_context("spawn")  # graphics contexts do not survive a fork
 
 
@@ -31,7 +31,8 @@ class Worker:
 
 
 class ProcessPool:
-    """`size` processes (0: one for each core). `on_message` is called with each message."""
+    """Records rounds in `size` processes (0: one per core). `on_message` is called with the frames
+    done and with each finished round."""
 
     def __init__(self, size: int, on_message: OnMessage, timeouts: Timeouts | None = None) -> None:
         self._size = size or os.cpu_count() or 1
@@ -41,10 +42,10 @@ class ProcessPool:
         self._queue = RetryQueue((), self._timeouts, on_message)
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
-        """Record all rounds; returns those that failed finally or too often.
+        """Record the rounds of `jobs`; return the rounds that could not be recorded.
 
-        Raises errors that every round would meet (disk full, unknown track): UserError or OSError.
-        All processes have ended when it returns or raises.
+        Raises UserError or OSError for an error that would stop every round (disk full, unknown
+        track). All processes have ended when this method returns or raises.
         """
         self._queue = RetryQueue(jobs, self._timeouts, self._on_message)
         try:
@@ -71,7 +72,7 @@ class ProcessPool:
         return Worker(process, mine)
 
     def _assign(self) -> bool:
-        """Give a round to each idle worker; False when all rounds are done."""
+        """Give a round to each idle worker; return False when all rounds are done."""
         for worker in self._workers:
             if worker.job is not None:
                 continue
@@ -86,7 +87,8 @@ class ProcessPool:
         return bool(self._queue) or any(worker.job is not None for worker in self._workers)
 
     def _receive(self) -> None:
-        """Handle messages; wait for a message until the next deadline or attempt."""
+        """Wait until a message arrives, a worker's deadline passes or a retry is due; handle the
+        messages."""
         idle = any(worker.job is None for worker in self._workers)
         due = min(worker.deadline(self._timeouts) for worker in self._workers)
         due = min(due, self._queue.next_at() if idle else due)
@@ -122,7 +124,7 @@ class ProcessPool:
             self._queue.record_outcome(job, message)
 
     def _replace(self, number: int, reason: str) -> None:
-        """Start another worker in place of an ended one."""
+        """Replace worker `number`, whose process has ended; its round is tried again."""
         ended = self._workers[number]
         ended.connection.close()
         ended.process.join()
@@ -157,7 +159,8 @@ def _code(process: BaseProcess) -> int | None:
 
 @contextmanager
 def _single_threaded(workers: int) -> Iterator[None]:
-    """Set `thread_limits` for child processes: libraries read them when they are loaded."""
+    """Set the environment variables of `thread_limits` within the block. Libraries in the child
+    processes read them when they are loaded."""
     limits = thread_limits(workers)
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)

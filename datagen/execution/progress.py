@@ -1,4 +1,4 @@
-"""Progress of a collection: counted from the messages of the executor, and shown as a bar."""
+"""Counts the progress of a collection from the executor's messages, and shows it as a bar."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,8 +32,8 @@ class ProgressCallback(Protocol):
 class CollectResult:
     """Result of a collection: `rounds` and `frames` in the folder, `recorded_frames` in this run.
 
-    `content_hash` is the hash of the dataset (see `datagen.recording.dataset`); None while other
-    shards of the plan are missing.
+    `content_hash` is the SHA-256 over all images and labels of the dataset; None while other shards
+    of the plan are missing. `resets`: how often the car was reset onto the road.
     """
 
     rounds: int
@@ -87,9 +87,9 @@ class CollectProgress:
 
 
 class FramesPerSecond(ProgressColumn):
-    """Frames per second: of the recent frames while running, of the whole run at the end.
+    """Column of the progress bar: frames per second, at the end those of the whole run.
 
-    Frames from earlier runs (the field `begun`) do not count.
+    Frames from earlier runs (the field `begun` of the task) do not count.
     """
 
     def render(self, task: Task) -> Text:
@@ -105,7 +105,7 @@ def progress_bar(
 ) -> Iterator[ProgressCallback]:
     """Show a bar on stderr, below `heading`, for the duration of the block.
 
-    Yields the function that updates it; the bar appears at the first update.
+    Yields the function that updates the bar; the bar appears at the first update.
     """
     bar = Progress(
         TextColumn("[bold]{task.description}"),

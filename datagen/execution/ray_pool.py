@@ -1,4 +1,4 @@
-"""Records rounds on a Ray cluster; the files are collected in one folder on this machine.
+"""Records rounds on a Ray cluster and moves their files into one folder on this machine.
 
 datagen collect --executor ray        # on the cluster at $RAY_ADDRESS, else on this machine
 
@@ -26,7 +26,7 @@ POLL_S = 0.5
 
 
 class Recorder:
-    """The Ray actor: records in its main thread; another thread answers `heartbeat`."""
+    """The Ray actor. Its main thread records; another thread answers `heartbeat`."""
 
     def __init__(self) -> None:
         from datagen.recorder.job import warm_up
@@ -36,7 +36,7 @@ class Recorder:
         warm_up()
 
     def record(self, job: Job) -> tuple[Outcome, bytes]:
-        """Record a round: the outcome, and the bytes of the file (empty unless RoundDone)."""
+        """Try to record a round. Returns the outcome and the file's bytes (empty on failure)."""
         with tempfile.TemporaryDirectory(prefix="datagen-") as home:
             prepare(Path(home))
             ending = attempt(replace(job, folder=Path(home)), self._report)
@@ -45,7 +45,7 @@ class Recorder:
             return ending, (Path(home) / ending.state.file).read_bytes()
 
     def heartbeat(self) -> tuple[int, int]:
-        """Number of heartbeats so far, and frames of the current round."""
+        """Number of progress messages so far, and frames recorded of the current round."""
         return self._heartbeats, self._frames
 
     def _report(self, message: FramesDone) -> None:
@@ -55,7 +55,7 @@ class Recorder:
 
 @dataclass
 class ActorSlot:
-    """One actor and its current round."""
+    """One actor and the round that it records."""
 
     actor: Any
     job: Job | None = None
@@ -63,7 +63,8 @@ class ActorSlot:
     heartbeat: Any = None
     heartbeats: int = -1
     started: float | None = None
-    """Time of its first heartbeat with this job: an actor may wait long for a free machine."""
+    """Monotonic time (s) of the first heartbeat in this job; None before it, because an actor can
+    wait long for a free machine."""
     last_heartbeat: float = 0.0
 
     def deadline(self, timeouts: Timeouts) -> float:
@@ -73,7 +74,8 @@ class ActorSlot:
 
 
 class RayPool:
-    """`size` actors (0: one for each core of the cluster), with the interface of ProcessPool."""
+    """Records rounds with `size` actors (0: one per core of the cluster). `on_message` is called
+    with the frames done and with each finished round."""
 
     def __init__(self, size: int, on_message: OnMessage, timeouts: Timeouts | None = None) -> None:
         self._ray = _import_ray()
@@ -84,9 +86,10 @@ class RayPool:
         self._queue = RetryQueue((), self._timeouts, on_message)
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
-        """Record all rounds; returns those that failed finally or too often.
+        """Record the rounds of `jobs`; return the rounds that could not be recorded.
 
-        Raises UserError without a Ray cluster, and errors that every round would meet.
+        Raises UserError without a Ray cluster, and UserError or OSError for an error that would
+        stop every round.
         """
         self._queue = RetryQueue(jobs, self._timeouts, self._on_message)
         if not self._queue:
@@ -109,7 +112,8 @@ class RayPool:
         return self._queue.failures
 
     def _connect(self) -> bool:
-        """Join the cluster, or start one here; False if this process was already connected."""
+        """Join the cluster at $RAY_ADDRESS, or start one on this machine. Returns False if this
+        process was already connected."""
         if self._ray.is_initialized():
             return False
         # Only the named cluster: one found by chance may belong to another collection.
@@ -201,7 +205,8 @@ class RayPool:
 
 
 def _received(job: Job, ending: Outcome, data: bytes) -> Outcome:
-    """The outcome, once the bytes of a finished round are in the dataset folder."""
+    """Move the bytes of a finished round into the dataset folder; return the outcome, AttemptFailed
+    if the bytes were damaged in transfer."""
     if not isinstance(ending, RoundDone):
         return ending
     if hashlib.sha256(data).hexdigest() != ending.state.sha256:

@@ -1,4 +1,4 @@
-"""The queue of rounds to record, with retries; used by all executors."""
+"""The queue of rounds to record and to record again after a failure, for all executors."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ DEATHS_IN_A_ROW = 12
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """Time limits in s, measured with the monotonic clock."""
+    """Time limits and delays of an executor, in s."""
 
     heartbeat_s: float = 300.0
     """A process that sends no message for this time counts as hanging and is stopped. It sends no
@@ -25,10 +25,11 @@ class Timeouts:
     frame_s: float = 1.0
     """A round may take `round_start_s` plus this time for each frame."""
     retry_delay_s: float = 1.0
-    """Delay before the second attempt; four times as long before the third."""
+    """Delay before the second attempt. The delay before the third attempt is four times as long."""
 
     def deadline(self, job: Job | None, started: float, last_heartbeat: float) -> float:
-        """Time at which a process that records `job` is stopped; infinite without a job."""
+        """Monotonic time (s) at which a process that records `job` since `started` is stopped;
+        infinite without a job."""
         if job is None:
             return float("inf")
         round_s = self.round_start_s + self.frame_s * job.plan.frames
@@ -40,11 +41,11 @@ class Failure:
     round_id: str
     reason: str
     final: bool
-    """True if the same round would fail again."""
+    """True if another attempt would fail in the same way."""
 
 
 class RetryQueue:
-    """The rounds that wait, each with the earliest time of its next attempt.
+    """The rounds that wait to be recorded, each with the earliest time of its next attempt.
 
     `on_message` is called for each finished round, and with 0 frames for each failed attempt.
     """
@@ -61,7 +62,8 @@ class RetryQueue:
         return len(self._waiting)
 
     def take(self, now: float) -> Job | None:
-        """Remove and return the first round that may be attempted at `now`; None without one."""
+        """Remove and return the first round whose next attempt is due at `now` (s); None if no
+        attempt is due."""
         for place, (not_before, job) in enumerate(self._waiting):
             if not_before <= now:
                 del self._waiting[place]
@@ -69,11 +71,12 @@ class RetryQueue:
         return None
 
     def next_at(self) -> float:
-        """Time of the next attempt; infinite when no round waits."""
+        """Monotonic time (s) of the earliest next attempt; infinite if no round waits."""
         return min((not_before for not_before, _ in self._waiting), default=float("inf"))
 
     def record_outcome(self, job: Job, outcome: Outcome) -> None:
-        """Handle the end of an attempt. Raises an error that every round would meet."""
+        """Handle the outcome of an attempt: pass on a finished round, schedule a failed round
+        again, or raise the error of a FatalError."""
         if isinstance(outcome, FatalError):
             raise outcome.error
         if isinstance(outcome, AttemptFailed):
@@ -85,7 +88,7 @@ class RetryQueue:
     def record_death(self, job: Job | None, reason: str) -> None:
         """Count an ended process and schedule its round again.
 
-        Raises DatasetError at `DEATHS_IN_A_ROW` without a success.
+        Raises DatasetError after `DEATHS_IN_A_ROW` ended processes without a finished round.
         """
         self._deaths += 1
         if self._deaths >= DEATHS_IN_A_ROW:

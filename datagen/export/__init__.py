@@ -1,1 +1,1 @@
-"""Export of datasets to WebDataset and LeRobot; encoded images are copied unchanged."""
+"""Exports datasets to WebDataset and LeRobot; encoded images are copied unchanged."""

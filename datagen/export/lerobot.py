@@ -1,7 +1,7 @@
-"""A dataset as a LeRobotDataset v3.0: one episode per round, images embedded in parquet files.
+"""Writes a dataset as a LeRobotDataset v3.0: one episode per round, images in parquet files.
 
-Read it with LeRobotDataset("driverview/data", root=OUT). Image bytes are copied as recorded.
-Episodes are in the order train, test; `splits` in meta/info.json has the episodes of each side.
+LeRobotDataset("driverview/data", root=OUT) reads it. Image bytes are copied as recorded. Episodes
+are sorted by side (train, test, unseen); `splits` in meta/info.json has the episodes of each side.
 Source of the format: github.com/huggingface/lerobot, datasets/lerobot_dataset.py and utils.py.
 """
 
@@ -52,7 +52,8 @@ def _task(info: RoundInfo) -> str:
 
 
 class _DataFiles:
-    """Writes data/chunk-000/file-000.parquet and so on: a row group per episode, FILE_MB each."""
+    """Writes data/chunk-000/file-000.parquet and so on: files of at most about `FILE_MB` MiB, with
+    one row group per episode."""
 
     def __init__(self, folder: Path) -> None:
         self.place = (0, 0)  # numbers of the chunk and of the file in it
@@ -155,7 +156,7 @@ class _Episodes:
 
 
 def _write_tasks(path: Path, tasks: list[str]) -> None:
-    """A pandas table whose index is the task's text."""
+    """Write the tasks as a pandas table to a parquet file: the index is the text of the task."""
     path.parent.mkdir(parents=True, exist_ok=True)
     about = {
         "index_columns": [INDEX_NAME],

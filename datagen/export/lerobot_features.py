@@ -1,4 +1,4 @@
-"""Features of a LeRobot export, and their columns in its parquet files.
+"""Defines the features of a LeRobot export and makes their columns for its parquet files.
 
 Source: LeRobotDataset v3.0, github.com/huggingface/lerobot. Vectors are float32; an absent distance
 is NaN, because LeRobot's tensors hold no nulls. Units and signs are the same as in the recording.
@@ -38,7 +38,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def features(camera: CameraParameters) -> dict[str, Any]:
-    """`features` of meta/info.json."""
+    """The value of `features` in meta/info.json: type, shape and names of each column."""
     image = {
         "dtype": "image",
         "shape": [camera.height, camera.width, 3],
@@ -55,8 +55,8 @@ def features(camera: CameraParameters) -> dict[str, Any]:
 
 
 def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int) -> Columns:
-    """The columns of an episode by name, one row per frame, without the images. `first`: index of
-    the episode's first frame in the dataset."""
+    """The columns of an episode by name, one row per frame, without the images. `first` is the
+    index of the episode's first frame in the dataset; `fps` gives the timestamps in s."""
     rows = [_row(step) for step in steps]
     found: Columns = {
         name: np.array([[row[part] for part in parts] for row in rows], np.float32)
@@ -77,7 +77,7 @@ def _row(step: Step) -> dict[str, Any]:
 
 
 def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
-    """The rows of an episode, as a table for the files in data/."""
+    """The rows of an episode with their encoded images, as a table for the files in data/."""
     images = pa.StructArray.from_arrays(
         [
             pa.array([bytes(step.image) for step in steps], pa.binary()),
@@ -98,7 +98,8 @@ def _array(column: NDArray[Any]) -> pa.Array:
 
 
 def _hugging_face() -> str:
-    """Metadata by which the library `datasets` decodes the image column."""
+    """Metadata (JSON) with the types of all columns; the library `datasets` needs it to decode the
+    image column."""
     types: dict[str, Any] = {IMAGE: {"_type": "Image"}}
     for name, parts in VECTORS.items():
         number = {"dtype": "float32", "_type": "Value"}

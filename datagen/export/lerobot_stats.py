@@ -1,7 +1,8 @@
-"""Statistics with which LeRobot normalises: of each episode, and of the whole dataset.
+"""Computes the statistics that LeRobot uses for normalisation, per episode and per dataset.
 
-Statistics of numbers skip absent values (zeros for a column without values). Statistics of images
-use histograms of each channel over frames spread over the episode: in [0, 1], shape (3, 1, 1).
+Statistics of numbers skip absent values; they are 0 for a column without values. Statistics of
+images are in [0, 1] with shape (3, 1, 1). They are computed from histograms of each channel, over
+frames spread over the episode.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,8 @@ Stats = dict[str, list[Any]]
 
 
 def column_stats(columns: Mapping[str, NDArray[Any]]) -> dict[str, Stats]:
-    """Statistics of each column, (N,) or (N, k), as lists of k values."""
+    """Statistics (min, max, mean, std, quantiles, count) of each column, (N,) or (N, k), as lists
+    of k values."""
     return {name: _stats_of_column(column) for name, column in columns.items()}
 
 
@@ -47,7 +49,7 @@ def _stats_of_values(values: NDArray[np.float64]) -> dict[str, float]:
 
 
 class Histogram:
-    """Counts of each level, 0 to 255, of each channel."""
+    """Number of pixels with each level (0 to 255) in each of the three colour channels."""
 
     def __init__(self) -> None:
         self.images = 0
@@ -55,7 +57,8 @@ class Histogram:
 
     @staticmethod
     def of(steps: Sequence[Step], camera: CameraParameters) -> "Histogram":
-        """Count the pixels of an episode. Raises ValueError for an image that cannot be decoded."""
+        """Count the pixels in up to `MOST_IMAGES` frames of an episode. Raises ValueError for an
+        image that cannot be decoded."""
         found = Histogram()
         image = np.empty((camera.height, camera.width, 3), np.uint8)
         chosen = np.linspace(0, len(steps) - 1, min(len(steps), MOST_IMAGES)).astype(int)

@@ -1,7 +1,7 @@
-"""The output folder of an export, written atomically.
+"""Writes the output folder of an export atomically.
 
-It is written as `.NAME.partial` beside the target and renamed when complete, so that a killed
-export is never taken for a complete one. The next export deletes an incomplete folder.
+The folder is written as `.NAME.partial` beside the target and renamed when it is complete. So a
+killed export leaves no folder that looks complete; the next export deletes what it left.
 """
 
 import os
@@ -47,7 +47,8 @@ def require_free(target: Path) -> None:
 
 
 def _lock(descriptor: int, partial: Path, target: Path) -> None:
-    """Lock the folder until this process ends; UserError if another export uses or renamed it."""
+    """Lock the folder until `descriptor` is closed. Raises UserError if another export uses or has
+    renamed it."""
     is_ours = try_lock(descriptor) and partial.exists()
     if not is_ours or partial.stat().st_ino != os.fstat(descriptor).st_ino:
         raise UserError(f"another `datagen export` is writing to {target}; give another --out")

@@ -1,4 +1,4 @@
-"""Exports chosen rounds of a dataset in one format into a new folder."""
+"""Exports the rounds of one side of a dataset, or of all sides, into a new folder."""
 
 from dataclasses import dataclass
 from importlib.resources import files
@@ -26,7 +26,7 @@ class ExportConfig:
     shuffle: bool
 
     def validate(self) -> None:
-        """Raise UserError for impossible options, before anything is read."""
+        """Raise UserError for impossible options; called before the dataset is read."""
         if self.format not in FORMATS:
             raise UserError(f"there is no format {self.format!r}; choose {' or '.join(FORMATS)}")
         if self.shard_size < 1:
@@ -42,7 +42,8 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """Result of an export; `content_hash` is the hash of the source dataset."""
+    """Result of an export: `out` has `files` files of `bytes` bytes in total. `content_hash` is the
+    hash of the exported dataset."""
 
     format: str
     out: str
@@ -54,7 +55,10 @@ class ExportResult:
 
 
 def export(folder: Path, out: Path, config: ExportConfig, progress: Progress) -> ExportResult:
-    """Write the export. Raises UserError (DatasetError) or OSError; `out` then does not exist."""
+    """Export the dataset `folder` to the new folder `out`; `progress` gets the frames written.
+
+    Raises UserError (DatasetError) or OSError; `out` then does not exist.
+    """
     config.validate()
     require_free(out)
     dataset = Dataset.open(folder)
@@ -89,7 +93,7 @@ def _write(
 
 
 def _card(dataset: Dataset, parts: list[Side], kind: str, shard_size: int) -> str:
-    """The README.md of an export: markdown with the front matter for Hugging Face, from the
+    """Text of the export's README.md (Markdown with front matter for Hugging Face), made from the
     template `webdataset.md` or `lerobot.md`."""
     counts = ", ".join(
         f"{side.name} {counted(side.frames, 'frame')} of {counted(len(side.rounds), 'round')}"

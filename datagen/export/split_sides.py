@@ -1,4 +1,4 @@
-"""Rounds of an export in order: train, test, unseen, then those without a side."""
+"""Sorts the rounds of an export by side: train, test, unseen, then rounds on no side."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ NO_SIDE = "unsplit"
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """Rounds of one side of the split, sorted by name."""
+    """The rounds on one side of the split, sorted by name."""
 
     name: str
     rounds: tuple[RoundInfo, ...]
@@ -27,13 +27,14 @@ class Side:
         return sum(info.frames for info in self.rounds)
 
     def open(self) -> Iterator[tuple[RoundInfo, Steps]]:
-        """Yield each round, opened when it is reached."""
+        """Yield each round with its steps; a round is opened when the iteration reaches it."""
         for info in self.rounds:
             yield info, Steps.open(info.path)
 
 
 def sides(dataset: Dataset, split: str) -> list[Side]:
-    """Sides of `split` (a side or "all") that have rounds. Raises DatasetError if none has."""
+    """The sides that have rounds; only the side `split` unless it is "all". Raises DatasetError if
+    there is no round."""
     chosen = dataset.select(split).rounds
     found = [
         Side(name or NO_SIDE, tuple(info for info in chosen if info.split == name))

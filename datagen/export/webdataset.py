@@ -1,7 +1,7 @@
-"""A dataset as WebDataset shards: `train-000000.tar` and so on, two files per frame.
+"""Writes a dataset as WebDataset shards: `train-000000.tar` and so on, two files per frame.
 
-KEY.jpg is the recorded image, byte for byte (KEY.png in lossless rounds), KEY.json the truth of the
-frame; `sample.schema.json` beside the shards describes unit, frame and meaning of each value.
+KEY.jpg (KEY.png in lossless rounds) is the recorded image, byte for byte. KEY.json has the frame's
+labels, state and command; `sample.schema.json` beside the shards describes each of its values.
 The same dataset gives the same bytes. Source: github.com/webdataset/webdataset.
 """
 
@@ -28,7 +28,7 @@ SHUFFLE_SEED = 0
 def write(
     folder: Path, parts: list[Side], shard_size: int, shuffle: bool, progress: Progress
 ) -> None:
-    """Write the shards of all sides into `folder`."""
+    """Write the shards of all sides, `shard_size` frames each, into `folder`."""
     (folder / SCHEMA_FILE).write_text(json.dumps(sample_schema(), indent=1) + "\n")
     done = 0
     for side in parts:
@@ -64,7 +64,7 @@ def _add_sample(shard: tarfile.TarFile, info: RoundInfo, step: Step, codec: str)
 
 
 def sample(info: RoundInfo, step: Step) -> dict[str, Any]:
-    """Content of KEY.json; absent distances are null."""
+    """The content of KEY.json for a frame; absent distances are None (null)."""
     return {
         "round": info.id,
         "frame": step.number,
@@ -89,8 +89,8 @@ def sample_schema() -> dict[str, Any]:
     recorded = json_schema()
     text, count = {"type": "string"}, {"type": "integer", "minimum": 0}
     parts = {
-        "round": text | {"description": "id of the round: frames of one are alike"},
-        "frame": count | {"description": "number in its round"},
+        "round": text | {"description": "id of the round; frames of a round are similar"},
+        "frame": count | {"description": "number of the frame in its round"},
         "time_s": {"type": "number", "description": "since the start of the round", "x-unit": "s"},
         "split": text,
         "track": text,

@@ -1,1 +1,1 @@
-"""The plan of a dataset: configuration, rounds, class balance, split."""
+"""Makes the plan of a dataset: options, rounds, class balance and split."""

@@ -1,8 +1,8 @@
-"""Starts of the rounds, chosen so that no class of the heading (left, straight, right) is rare.
+"""Chooses the starts of the rounds so that no class of the road (left, straight, right) is rare.
 
 Roads are straight for most of their length, and circuits turn more to one side than to the other.
-The classes of a round's frames are forecast from the track and the scripted speed alone: nothing is
-simulated, and the delay by traffic on one lane is estimated.
+The classes of a round's frames are forecast from the track and the scripted speed, without a
+simulation; the delay by traffic on one lane is estimated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,25 +29,27 @@ FloatArray = NDArray[np.float64]
 KMH = 3.6  # km/h per m/s
 
 MIN_SHARE = 0.15
-"""Least share of the frames for each class."""
+"""A class with a smaller share of the frames is rare; the table of the plan then has a note."""
 TARGET_SHARE = 0.19
-"""Share that the forecast aims at: `MIN_SHARE` plus the error of the forecast."""
+"""Forecast share that each class should have: `MIN_SHARE` plus a margin for forecast errors."""
 START_CANDIDATES = 48
-"""Number of starts tried for each round, evenly around the lap."""
+"""Number of starts tried for each round, evenly spaced around the lap."""
 MIN_GAIN = 1e-4
-"""A start is changed only for a gain in share of at least this, divided by the number of rounds."""
+"""A start is changed only if the shares missing to `TARGET_SHARE` then fall by at least this number
+divided by the number of rounds."""
 
 
 class Forecast(Protocol):
-    """Forecasts the classes of a round's frames for other starts."""
+    """Forecasts the classes of a round's frames for several possible starts of the round."""
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
-        """Shares (N, 3) of the classes left, straight, right from each of `starts` (N,)."""
+        """Shares (N, 3) of left, straight and right frames if the round starts at `starts` (N,),
+        which are shares of the lap's length."""
 
 
 @dataclass(frozen=True)
 class _LapProfile:
-    """A lap in cells of equal length: the class of the heading and the speed limit of each."""
+    """A lap divided into cells of equal length, with the road class and speed limit of each."""
 
     is_class: NDArray[np.bool_]  # (3, cells)
     limit: FloatArray  # (cells,), m/s
@@ -55,7 +57,7 @@ class _LapProfile:
 
 
 class TrackForecast:
-    """A Forecast from the geometry of the tracks, given by name."""
+    """A `Forecast` computed from the geometry of `tracks`, a map from names to tracks."""
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
         self._tracks = dict(tracks)
@@ -63,8 +65,8 @@ class TrackForecast:
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
-        """Read the chosen tracks from their files. A random road is made later, for the first
-        forecast of a round on it."""
+        """Create the forecast for the chosen tracks, read from their files. A random road is
+        generated at the first forecast of a round on it."""
         named = (c.name for c in choices if c.name != RANDOM)
         return TrackForecast({name: find_track(name, tracks_dir) for name in named})
 
@@ -99,8 +101,8 @@ class TrackForecast:
 
 
 def expected_speed(entry: RoundPlan) -> float:
-    """Speed on a straight, m/s. On one lane it is the slowest car's speed, as nobody can
-    overtake."""
+    """Expected speed of a round's car on a straight, m/s. On one lane nobody can overtake, so it is
+    at most the expected speed of the slowest other car."""
     speed = entry.speed_kmh
     if entry.lanes == 1 and entry.traffic:
         low, high = DESIRED_KMH
@@ -109,7 +111,8 @@ def expected_speed(entry: RoundPlan) -> float:
 
 
 def balance_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> tuple[RoundPlan, ...]:
-    """The same rounds, some with other starts. Each side of the split is balanced on its own."""
+    """Return the rounds with some starts changed so that no class is rare on any side of the
+    split."""
     moved = list(rounds)
     for side in dict.fromkeys(entry.split for entry in moved):
         numbers = [i for i, entry in enumerate(moved) if entry.split == side]
@@ -119,14 +122,14 @@ def balance_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> tuple[Rou
 
 
 def expected_shares(rounds: Sequence[RoundPlan], forecast: Forecast) -> FloatArray:
-    """Shares (3,) of left, straight and right over all frames of `rounds`."""
+    """Forecast shares (3,) of left, straight and right frames, over all frames of `rounds`."""
     each = np.array([forecast(entry, np.array([entry.start]))[0] for entry in rounds])
     return np.asarray(np.average(each, axis=0, weights=[entry.frames for entry in rounds]))
 
 
 def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int, float]:
-    """New starts by index in `rounds`, chosen greedily by the greatest gain until all classes reach
-    `TARGET_SHARE` or no change helps."""
+    """Choose new starts, and return them by index in `rounds`. Each iteration makes the change with
+    the greatest gain, until all classes reach `TARGET_SHARE` or no change helps."""
     shares = np.array([forecast(entry, np.array([entry.start]))[0] for entry in rounds])
     steps = np.arange(START_CANDIDATES) / START_CANDIDATES
     starts = [(entry.start + steps) % 1.0 for entry in rounds]
@@ -145,5 +148,5 @@ def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int,
 
 
 def _missing_share(shares: FloatArray) -> FloatArray:
-    """Sum over the classes of the shortfall from `TARGET_SHARE`; `shares` (..., 3)."""
+    """Sum over the classes of the amounts by which `shares` (..., 3) are below `TARGET_SHARE`."""
     return np.asarray(np.maximum(TARGET_SHARE - shares, 0.0).sum(axis=-1))

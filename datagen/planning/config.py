@@ -1,6 +1,6 @@
-"""The options of a collection: name, help text and default of each.
+"""The options of `datagen collect` and `datagen protocol`, with their help texts and defaults.
 
-Annotated fields are options of the commands (`runtime.options.options_of`).
+`runtime.options.options_of` makes command-line options of the annotated fields.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -19,10 +19,11 @@ DATASET_FOLDER = Path("datasets/default")
 UNSEEN_FOLDER = Path("datasets/unseen")
 
 FRAMES_PER_SCENE = 200
-"""Default number of frames for each scene; building one takes as long as about 15 frames."""
+"""Default number of frames per scene (scenery with its light). Building a scene takes as long as
+rendering about 15 frames."""
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
-"""With more rounds, the seeds would overlap with the seeds of another plan."""
+"""Largest number of rounds of a plan; the seeds of more rounds would overlap with another plan."""
 
 
 def all_lights() -> tuple[str, ...]:
@@ -34,8 +35,8 @@ def all_lights() -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TrackChoice:
-    """Name of a track and the hash of its geometry when the plan was made; or `random` without a
-    hash: a random road for each round."""
+    """A track and the hash of its geometry when the plan was made. The name `random` with an empty
+    hash stands for a different random road in each round."""
 
     name: str
     content_hash: str
@@ -69,7 +70,7 @@ SplitName = Annotated[
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Options of a collection. Raises UserError for values that cannot be collected."""
+    """Options of `datagen collect`. The constructor raises UserError for impossible values."""
 
     rounds: Rounds = 60
     frames: Frames = 2000
@@ -107,7 +108,7 @@ class CollectConfig:
     split: SplitName = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """The options by name; options in `LATER` only if they differ from their defaults."""
+        """The options by name. Options in `LATER` are left out if they have their defaults."""
         options = asdict(self, dict_factory=stored)
         return {k: v for k, v in options.items() if k not in LATER or v != LATER[k]}
 
@@ -169,13 +170,13 @@ class CollectConfig:
 
 
 LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
-"""Options that plans of earlier versions do not have, with their defaults."""
+"""Defaults of options that did not exist when earlier versions wrote their plans."""
 
 
 @dataclass(frozen=True)
 class ProtocolConfig:
     """Options of `datagen protocol`. By default 15 rounds of 2,000 images are recorded, as many
-    images as the paper has. Raises UserError for drives of zero length."""
+    images as the paper has. The constructor raises UserError unless `laps` is positive."""
 
     rounds: Annotated[int, Option(help="Rounds on the nine tracks.")] = 15
     frames: Annotated[int, Option(help="Frames per round on the nine tracks.")] = 2000

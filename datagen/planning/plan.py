@@ -1,6 +1,6 @@
-"""The plan of a dataset: one entry for each round, fixed before the first frame.
+"""The plan of a dataset: one entry for each round, fixed before the first frame is recorded.
 
-A round is a pure function of its entry. `datagen.planning.planner` makes the entries.
+An entry determines its round completely. `datagen.planning.planner` makes the entries.
 """
 
 import hashlib
@@ -20,22 +20,24 @@ from trackfeatures.errors import UserError
 from trackfeatures.names import require_name
 
 CONTROL_HZ = 20
-"""Lowest rate of control steps, Hz."""
+"""Lowest rate of control steps, Hz; at a lower frame rate there are several steps per frame."""
 
 
 def program() -> str:
-    """Name and version of this program: another version may record the same round differently."""
+    """Name and version of this program. A plan's hash contains them, because another version can
+    record the same round differently."""
     return f"driverview {version('driverview')}"
 
 
 def check_entry(entry: dict[str, Any]) -> str:
-    """The id of a round in a `plan.json`; raises BadName for a bad name, KeyError without one."""
+    """Return the id of a round's entry in `plan.json`. Raises BadName if the id cannot be a file
+    name, and KeyError if it is missing."""
     return require_name(entry["id"], "round id")
 
 
 @dataclass(frozen=True, slots=True)
 class RoundPlan:
-    """All inputs of one round."""
+    """The entry of one round in the plan: all values that determine the recorded round."""
 
     id: str
     seed: int
@@ -49,7 +51,7 @@ class RoundPlan:
     lights: tuple[str, ...]
     """Light of each scene. Stretches show the scenes in order and start again after the last."""
     stretch: int
-    """Frames; 0: the whole round is one stretch."""
+    """Number of frames between two changes of the scene; 0: the scene never changes."""
     speed_kmh: float
     start: float
     """Start position on the lap, as a share of its length."""
@@ -64,7 +66,8 @@ class RoundPlan:
     """The random values of a varied road; None on the paper's roads."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry of `plan.json`; paper's roads have no key `varied`, as in earlier versions."""
+        """The entry as in `plan.json`. It has no key `varied` on the paper's roads, as in earlier
+        versions."""
         entry = asdict(self, dict_factory=stored)
         if self.varied is None:
             del entry["varied"]
@@ -72,15 +75,16 @@ class RoundPlan:
 
     @property
     def steps_per_frame(self) -> int:
-        """Control steps from one frame to the next: the smallest number that gives at least
-        `CONTROL_HZ` and a control rate by which `PHYSICS_HZ` can be divided."""
+        """Number of control steps from one frame to the next: the smallest one with a control rate
+        of at least `CONTROL_HZ` that divides `PHYSICS_HZ`."""
         least = -(-CONTROL_HZ // self.frequency_hz)
         most = PHYSICS_HZ // self.frequency_hz
         return next(steps for steps in range(least, most + 1) if most % steps == 0)
 
     @staticmethod
     def from_json(entry: dict[str, Any]) -> "RoundPlan":
-        """Raises KeyError, TypeError or ValueError if `entry` was not made by this version."""
+        """Read an entry of `plan.json`. Raises KeyError, TypeError or ValueError if this version
+        did not write it."""
         check_entry(entry)
         cameras = {key: CameraParameters(**entry[key]) for key in ("camera", "nominal_camera")}
         varied = VariedRound.from_dict(entry["varied"]) if "varied" in entry else None
@@ -95,18 +99,19 @@ class Plan:
     config: CollectConfig
     rounds: tuple[RoundPlan, ...]
     driver: Mapping[str, str] = field(default_factory=dict)
-    """The driver, if it is not the scripted one; its rounds depend on it, so it is hashed, too."""
+    """Controller and hash of the model, if they drive instead of the scripted driver. They are part
+    of the plan's hash, because the rounds depend on them."""
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) of all entries, the program and the version of the definitions."""
+        """SHA-256 (hex) of all entries, the driver, the program and the definitions' version."""
         content: list[Any] = [tf.VERSION, program(), [entry.as_dict() for entry in self.rounds]]
         if self.driver:
             content.append(dict(self.driver))
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def as_json(self) -> dict[str, Any]:
-        """Content of `plan.json`; the options are under "wanted"."""
+        """Content of `plan.json`. The key "wanted" holds the options."""
         driver = {"driver": dict(self.driver)} if self.driver else {}
         return {
             "hash": self.hash,
@@ -130,7 +135,7 @@ class Shard:
 
     @staticmethod
     def parse(text: str) -> "Shard":
-        """Read "2/4". Raises UserError for anything else."""
+        """Read a text like "2/4" (number/count). Raises UserError for other text."""
         match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text.strip())
         shard = Shard(int(match[1]), int(match[2])) if match else Shard(0, 0)
         if not 1 <= shard.number <= shard.count:

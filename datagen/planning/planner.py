@@ -1,4 +1,4 @@
-"""Makes a plan from the options: every parameter of the rounds is spread evenly, from one seed.
+"""Makes a plan from the options. One seed determines all random choices.
 
 Tracks, lane counts, traffic, trajectories, lights and speeds are stratified, so that a short plan
 covers as many values as it can.
@@ -29,11 +29,11 @@ Value = TypeVar("Value")
 
 
 def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
-    """The plan of these options; the same options always give the same plan.
+    """Make the plan of these options; the same options always give the same plan.
 
-    With a `forecast`, rounds start where no class of the heading becomes rare.
+    With a `forecast`, the starts of the rounds are chosen so that no class of the road is rare.
     """
-    # The order of the draws below decides every plan: changing it changes all datasets.
+    # The order of the random choices below determines every plan: changing it changes all datasets.
     rng = np.random.default_rng([config.seed, 0])
     count = config.rounds
     tracks, lanes = _tracks_and_lanes(config, rng)
@@ -83,7 +83,7 @@ def stratified_shuffle(
 ) -> list[Value]:
     """`count` values: all of `values` in random order, then all again in another order, and so on.
 
-    The counts of two values differ by one at most.
+    Any two of `values` occur equally often, or one of them once more.
     """
     shuffled: list[Value] = []
     while len(shuffled) < count:
@@ -94,7 +94,7 @@ def stratified_shuffle(
 def _stratified_uniform(
     count: int, rng: np.random.Generator
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """One number from each of `count` equal parts of [0, 1), in random order."""
+    """Random numbers (count,): one from each of `count` equal parts of [0, 1), in random order."""
     return (rng.permutation(count) + rng.uniform(size=count)) / count
 
 
@@ -123,7 +123,7 @@ def _cameras(config: CollectConfig, rng: np.random.Generator) -> list[CameraPara
 def _roads(
     config: CollectConfig, lanes: Sequence[int], lights: Sequence[tuple[str, ...]]
 ) -> list[VariedRound | None]:
-    """The random values of each round's road, from the round's seed; None on the paper's roads."""
+    """Random values of the road of each round, from the round's seed; None on the paper's roads."""
     if config.roads == "paper":
         return [None] * config.rounds
     first, height_m = _first_seed(config), config.camera.height_above_road_m
@@ -148,7 +148,8 @@ def _lane_width(road: VariedRound | None) -> float:
 def _tracks_and_lanes(
     config: CollectConfig, rng: np.random.Generator
 ) -> tuple[list[TrackChoice], list[int]]:
-    """Cycles through the tracks, and on each track through the lane counts."""
+    """Track and lane count of each round. The rounds cycle through the tracks, and the rounds of a
+    track cycle through the lane counts."""
     order = rng.permutation(len(config.tracks))
     first = rng.permutation(len(config.tracks))
     tracks, lanes = [], []
@@ -160,7 +161,7 @@ def _tracks_and_lanes(
 
 
 def _track(choice: TrackChoice, round_seed: int) -> TrackChoice:
-    """The chosen track, or the random road of the round's seed."""
+    """Return `choice`; for the name `random`, the random road that `round_seed` determines."""
     if choice.name != RANDOM:
         return choice
     track = random_track(random_name(round_seed))
@@ -168,7 +169,7 @@ def _track(choice: TrackChoice, round_seed: int) -> TrackChoice:
 
 
 def _lights(config: CollectConfig, rng: np.random.Generator) -> list[tuple[str, ...]]:
-    """The light of each scene of each round, stratified over all scenes of the plan."""
+    """Names of the lights of each round's scenes, stratified over all scenes of the plan."""
     stretches = -(-config.frames // config.stretch) if config.stretch else 1
     scenes = min(stretches, config.scenes or max(1, config.frames // FRAMES_PER_SCENE))
     lights = stratified_shuffle(config.lights, config.rounds * scenes, rng)
@@ -176,7 +177,8 @@ def _lights(config: CollectConfig, rng: np.random.Generator) -> list[tuple[str, 
 
 
 def _starts(tracks: Sequence[TrackChoice], rng: np.random.Generator) -> list[float]:
-    """Start of each round, [0, 1): those on the same track follow a golden-ratio sequence."""
+    """Start of each round as a share of the lap, [0, 1). The starts of rounds on the same track
+    follow a golden-ratio sequence, which spreads them evenly."""
     golden = 0.6180339887498949
     first = {choice.name: rng.uniform() for choice in dict.fromkeys(tracks)}
     rounds_on: dict[str, int] = {}

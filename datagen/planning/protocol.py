@@ -1,8 +1,8 @@
-"""The plan of the paper's protocol (Li et al., section VII): the test data of its perception.
+"""Makes the plan of the paper's test data for perception (Li et al., section VII).
 
-Four laps near the middle of a one-lane road at 20 Hz, on g-track-3 and on dirt-3, in clear light
-and in heavy shadow, without traffic; and rounds on its nine tracks with one, two and three lanes,
-other cars and all trajectories. All of them are for tests.
+It has four drives near the middle of a one-lane road without traffic at 20 Hz: on g-track-3 and on
+dirt-3, each in clear light and in heavy shadow. It also has rounds on the paper's nine tracks with
+one, two and three lanes, other cars and all trajectories. No round is for training.
 """
 
 from dataclasses import replace
@@ -27,16 +27,17 @@ NINE_TRACKS = (
     "alpine-1", "alpine-2", "e-track-2", "e-track-3", "eroad", "forza",
     "g-track-1", "g-track-2", "g-track-3",
 )  # fmt: skip
-"""The paper names alpine-1, alpine-2, e-track-3, eroad, forza and g-track-3; it has nine."""
+"""The paper uses nine tracks and names six of them: alpine-1, alpine-2, e-track-3, eroad, forza and
+g-track-3. The other three are our choice."""
 DRIVEN_TRACKS = ("g-track-3", "dirt-3")
 LIGHTS = ("clear", "heavy-shadow")
 SPEED_KMH = 65.0  # the paper's vehicles: 60 to 75 km/h
 
 
 def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
-    """The plan; the rounds of the nine tracks come first, then the drives.
+    """Make the plan: first the rounds on the nine tracks, then the four drives.
 
-    Raises UnknownTrack where a track of TORCS is not found.
+    Raises UnknownTrack if a track of TORCS is not found.
     """
     collection = CollectConfig(
         rounds=config.rounds,
@@ -58,8 +59,8 @@ def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
 
 
 def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) -> RoundPlan:
-    """A drive of `frames` frames from the start line; all its other values are taken from the round
-    `like`."""
+    """Entry of a drive of `frames` frames from the start line. Values that the drives share with
+    other rounds are taken from the round `like`."""
     return replace(
         like,
         id=f"drive-{track.name}-{light}",
@@ -81,8 +82,8 @@ def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) ->
 def drive_frames(track: Track, laps: float, frequency_hz: int) -> int:
     """Number of frames in which the scripted driver drives `laps` laps from the start line.
 
-    The drive is simulated without images. Its speed profile alone gives up to 11 % less: the driver
-    brakes for limits 0.5 s ahead and has to accelerate after each bend.
+    The drive is simulated without images. The speed profile alone would give up to 11 % fewer
+    frames, because the driver brakes for limits 0.5 s ahead and accelerates after each bend.
     """
     road, speed = Road(track, 1), SPEED_KMH / 3.6
     course = make_course(MIDDLE, road, laps * track.length_m, np.random.default_rng(0))

@@ -1,5 +1,5 @@
-"""Chooses the rounds of a plan that are held out for testing: the same share of every track, lane
-count, trajectory and light."""
+"""Chooses the rounds of a plan that are held out for testing: about the same share of the rounds of
+every track, lane count, trajectory and light."""
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
@@ -17,16 +17,16 @@ def choose_test_rounds(
     attributes: Sequence[Sequence[Hashable]],
     rng: np.random.Generator,
 ) -> set[int]:
-    """Numbers of the rounds to test on: about `test_share` (0 to below 1) of all.
+    """Choose the test rounds, about `test_share` (0 to below 1) of all; return their numbers.
 
-    `tracks`, `lanes` and each sequence in `attributes` have one value for each round. The
-    rounds are spread evenly over the tracks first, then over lane counts and `attributes`; ties are
-    broken by one draw of `rng` for each round.
+    `tracks`, `lanes` and each sequence in `attributes` have one value for each round. The test
+    rounds are spread evenly over the tracks first, then over lane counts and `attributes`. A random
+    number for each round breaks ties.
 
-    Every track with three rounds or more is on both sides, even if this takes more test rounds than
-    the share. No track gives up its last training round while another has two, and no road (a track
-    with one lane count) its last one while another road has two: roads that were never trained on
-    are what `unseen` rounds are for.
+    Every track with at least three rounds is on both sides, even if this takes more test rounds
+    than `test_share`. The last training round of a track is chosen only if no other track has two
+    training rounds left. The same applies to roads (a road is a track with one lane count): tests
+    on roads without training rounds are the purpose of the side `unseen`.
     """
     count = len(tracks)
     if test_share == 0.0 or count < 2:
@@ -40,10 +40,10 @@ def choose_test_rounds(
     in_training = np.ones(count, bool)
     chosen: set[int] = set()
     for _ in range(_number_of_test_rounds(test_share, tracks)):
-        # Only rounds of the best roads can be chosen: compare roads first, there are few of them.
+        # Only rounds of the best roads can be chosen. Roads are compared first: there are few.
         best_roads = _best_roads(road, track, track_of_road)
         open_rounds = np.flatnonzero(in_training & best_roads[road.of])
-        # Summed from left to right: another order could round otherwise and choose other rounds.
+        # Summed from left to right: another order could round differently and choose other rounds.
         shares = sum(group.tested_share()[group.of[open_rounds]] for group in others)
         ties = open_rounds[shares == np.min(shares)]
         number = int(ties[np.argmin(draw[ties])])
@@ -71,7 +71,8 @@ class _Groups:
 
 
 def _best_roads(road: _Groups, track: _Groups, track_of_road: IntArray) -> NDArray[np.bool_]:
-    """Mask of the roads from which the next test round is taken; all of them are equally good."""
+    """Mask (roads,) of the roads from which the next test round can be taken; they are equally
+    good."""
     left = road.in_training()
     last_of_track = (track.in_training() == 1)[track_of_road]
     penalty = 2 * last_of_track + (left == 1) + 4 * (left == 0)

@@ -1,4 +1,4 @@
-"""A plan as tables for the terminal."""
+"""Formats a plan as tables for the terminal."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from simulator.track.random_roads.road import RANDOM, is_random
 
 
 def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, float]]:
-    """Forecast share of each class of the heading: of all rounds and of each side of the split."""
+    """Forecast share of each class of the road by name, for "all" rounds and for each side."""
     sides = {"all": list(plan.rounds), **_sides(plan)}
     return {
         name: {
@@ -28,7 +28,8 @@ def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, floa
 
 
 def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType:
-    """Number of rounds by each parameter, and the forecast classes, for each side of the split."""
+    """Table with a column for each side of the split: number of rounds by each parameter, and the
+    forecast `classes` (the result of `expected_classes`)."""
     sizes = {entry.frames for entry in plan.rounds}
     of_each = f" of {min(sizes)}" if len(sizes) == 1 else f", {sum(e.frames for e in plan.rounds)}"
     table = Table(title=f"{len(plan.rounds)} rounds{of_each} frames", box=None)
@@ -49,7 +50,7 @@ def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType
 
 
 def listing(plan: Plan) -> RenderableType:
-    """One row for each round."""
+    """Table with a row for each round of the plan."""
     table = Table(box=None)
     names = ("round", "split", "track", "lanes", "traffic", "trajectory", "light", "km/h", "start")
     for name in names:
@@ -82,7 +83,8 @@ def _sides(plan: Plan) -> dict[str, list[RoundPlan]]:
 
 
 def _track_group(name: str) -> str:
-    """Group of a track for counting: all random roads together, since each round has its own."""
+    """The name under which a track is counted: `random` for all random roads, because each of them
+    has only one round."""
     return RANDOM if is_random(name) else name
 
 

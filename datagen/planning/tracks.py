@@ -1,4 +1,5 @@
-"""The tracks of a collection: the project's and TORCS's, without those held out of training."""
+"""Chooses the tracks of a collection. By default these are all tracks of the project and of TORCS
+except four tracks that are held out of training."""
 
 from pathlib import Path
 
@@ -8,19 +9,19 @@ from simulator.track.random_roads.road import RANDOM
 from trackfeatures.errors import UserError
 
 HELD_OUT = ("coast", "countryside", "dirt-3", "e-track-4")
-"""Two tracks of the project and two of TORCS. A training plan uses them only if it names them; the
-split `unseen` consists of them."""
+"""Two tracks of the project and two of TORCS. A plan for training uses them only if the user names
+them. A plan with `--split unseen` uses only them by default."""
 
 
 def choose_tracks(
     names: tuple[str, ...], tracks_dir: Path | None, unseen: bool = False
 ) -> tuple[TrackChoice, ...]:
-    """The named tracks. Without names: the project's and all TORCS tracks found, not `HELD_OUT`.
+    """Return the named tracks with the hashes of their geometry.
 
-    With `unseen`: the tracks of `HELD_OUT` that are found, or named tracks outside training plans.
-    `random` is kept as it is: each round will have a random road of its own, which no other round
-    has. Raises UnknownTrack for a name that is not found, TrackError for a bad file, UserError for
-    a training track given as unseen.
+    Without names: all tracks of the project and of TORCS that are found, except `HELD_OUT`; with
+    `unseen`, the tracks of `HELD_OUT` that are found. The name `random` is kept: the plan later
+    gives each round a random road of its own. Raises UnknownTrack for a name that is not found,
+    TrackError for a bad file, and UserError for a training track that is given as unseen.
     """
     files = track_files(tracks_dir)
     held_out = tuple(name for name in HELD_OUT if name in files)
@@ -38,6 +39,7 @@ def _choice(name: str, tracks_dir: Path | None) -> TrackChoice:
 
 
 def _trained_on(file: Path) -> bool:
-    """Whether a plan without names uses the track; a user's own tracks must be named."""
+    """Whether a plan without names of tracks uses the track in `file`. It does not use a user's own
+    tracks."""
     ours = file.parent == OWN_TRACKS
     return file.stem not in HELD_OUT and (ours or file.suffix.lower() == ".xml")

@@ -1,1 +1,1 @@
-"""Recording one round: simulation, camera, writing, and replaying it."""
+"""Records one round (simulates, renders and writes it), and simulates recorded rounds again."""

@@ -1,6 +1,6 @@
-"""Records one round into a dataset folder, checked and atomically; and the recording process.
+"""Records one round, checks it and moves it atomically into a dataset folder.
 
-The processes on this machine and Ray actors use this module.
+Recording processes on this machine (`worker_main`) and Ray actors use this module.
 """
 
 import ctypes
@@ -37,19 +37,20 @@ PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A round to record, and where."""
+    """A round to record: its plan entry, the dataset folder and a further folder of tracks."""
 
     plan: RoundPlan
     plan_hash: str
     folder: Path
     tracks_dir: Path | None
     make_law: "MakeLaw | None" = None
-    """Makes the steering law that replaces the scripted driver's; it is sent to the processes."""
+    """Makes the steering law that replaces the scripted driver's; it must be picklable."""
 
 
 @dataclass(frozen=True, slots=True)
 class FramesDone:
-    """Frames recorded so far; also a heartbeat."""
+    """Message from a recording process: number of frames recorded so far. It is also a heartbeat:
+    a process that sends none for long is stopped."""
 
     round_id: str
     frames: int
@@ -57,7 +58,8 @@ class FramesDone:
 
 @dataclass(frozen=True, slots=True)
 class RoundDone:
-    """The round is in the dataset folder."""
+    """Outcome: the round is in the dataset folder. The car was reset onto the road `resets` times
+    in it."""
 
     state: RoundState
     resets: int
@@ -65,7 +67,8 @@ class RoundDone:
 
 @dataclass(frozen=True, slots=True)
 class AttemptFailed:
-    """This attempt failed. Another may succeed, unless `final`; other rounds are not affected."""
+    """Outcome: the attempt to record this round failed. Another attempt may succeed, unless
+    `final`."""
 
     round_id: str
     reason: str
@@ -74,7 +77,8 @@ class AttemptFailed:
 
 @dataclass(frozen=True, slots=True)
 class FatalError:
-    """An error that every round would meet, such as a full disk: the collection raises it."""
+    """Outcome: an error that would stop every round, such as a full disk. The collection raises
+    it."""
 
     error: UserError | OSError
 
@@ -85,7 +89,8 @@ Report = Callable[[FramesDone], None]
 
 
 def attempt(job: Job, report: Report) -> Outcome:
-    """Try to record a round and return the outcome. BrokenPipeError comes from `report` only."""
+    """Try to record a round and return the outcome. Errors become outcomes, except BrokenPipeError,
+    which `report` raises if the collector has ended."""
     try:
         return record_and_publish(job, report)
     except BrokenPipeError:
@@ -100,7 +105,8 @@ def attempt(job: Job, report: Report) -> Outcome:
 
 
 def record_and_publish(job: Job, report: Report = lambda message: None) -> RoundDone:
-    """Record one round, check the file, and move it into the dataset folder."""
+    """Record one round, check the file, and move it into the dataset folder. `report` is called
+    after every `REPORT_EVERY` frames and at the end."""
     # Imported here: the parent process imports this module and needs no physics or graphics.
     from datagen.recorder.record import record_round
 
@@ -120,7 +126,8 @@ def record_and_publish(job: Job, report: Report = lambda message: None) -> Round
 
 
 def _check_recorded(partial: Path) -> tuple[RoundState, int]:
-    """State of the recorded file, and number of resets. Raises RuntimeError if it is damaged."""
+    """Read the recorded file; return its state and the number of resets. Raises RuntimeError if it
+    is damaged."""
     index = open_round(partial)
     state = RoundState.of(partial, index.header, index.result)
     _, problems = check_round(partial, "full", state)
@@ -130,7 +137,7 @@ def _check_recorded(partial: Path) -> tuple[RoundState, int]:
 
 
 def _portable(error: UserError | OSError, folder: Path) -> UserError | OSError:
-    """The same error in a form that can be pickled, with the path where it happened."""
+    """The same error in a form that can be pickled. An OSError without a path gets `folder`."""
     if isinstance(error, OSError):
         where = error.filename or str(folder)
         return OSError(error.errno or 0, error.strerror or str(error), where)
@@ -138,7 +145,7 @@ def _portable(error: UserError | OSError, folder: Path) -> UserError | OSError:
 
 
 def worker_main(connection: Connection, parent: int) -> None:
-    """Main function of a recording process: records the rounds that come over `connection`.
+    """Main function of a recording process: records each `Job` received over `connection`.
 
     `parent` is the process id of the collector. One process records many rounds, because compiled
     code and the graphics context take seconds to set up.
@@ -161,7 +168,8 @@ def worker_main(connection: Connection, parent: int) -> None:
 
 
 def exit_with_parent(parent: int) -> None:
-    """Make this process end with its collector: another collector may record the round already."""
+    """Make this process end when its collector (process id `parent`) ends: another collector may
+    then record the same round."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:

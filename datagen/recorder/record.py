@@ -1,5 +1,5 @@
-"""Records one round: simulates, renders, measures and writes it. The recorded round is a pure
-function of its plan entry."""
+"""Records one round: simulates the drive, renders the images and writes them with their labels. The
+plan entry determines the recorded round completely."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,13 +31,13 @@ from simulator.varied.look import RoadLook
 from simulator.vehicle.state import CarState, Command
 from simulator.world.world import World
 
-MARKING_LENGTH_M = 60.0  # of the markings drawn into an image
+MARKING_LENGTH_M = 60.0  # length of road ahead whose markings are recorded with an image
 TRACK_LINE_STEP_M = 4.0
 NO_IMAGE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 EGO_NAMES = ("x", "y", "z", "yaw", "pitch", "roll", "vx", "vy", "yaw_rate")
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NOT_RECORDED = ("range_traffic",)
-MAX_RESETS = 20  # times control steps per frame: at low frame rates a round is a longer drive
+MAX_RESETS = 20  # times control steps per frame, because rounds at a low frame rate are longer
 # Frames are simulated, rendered and written in batches: the driver needs no image, and simulation
 # is twice as fast without rendering in between.
 BATCH_FRAMES = 20
@@ -46,11 +46,11 @@ SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries; larger 
 
 
 Scenery = tuple[int, Light, RoadLook | None]
-"""Seed of the scenery, light, and look of a varied road."""
+"""Arguments of `Camera.change_scene`: seed, light, and look of the road (None: the paper's)."""
 
 MakeLaw = Callable[[RoundPlan, World, Camera], SteeringLaw]
-"""Makes the law that steers a round in place of the scripted driver's, from the round's plan, its
-world and the camera on the car, which shows the scenery of the current frame."""
+"""Makes the steering law that replaces the scripted driver's in a round, from the plan entry, the
+world and the camera on the car. The camera shows the scenery of the current frame."""
 
 
 @dataclass
@@ -74,7 +74,7 @@ class RoundSimulation:
         self._start(start, self.driver.offset_at(0.0))
 
     def scenery_at(self, frame: int) -> Scenery:
-        """The scenery at a frame."""
+        """The scenery of frame `frame` (from 0) of the round."""
         return self.sceneries[
             frame // (self.plan.stretch or self.plan.frames) % len(self.sceneries)
         ]
@@ -84,7 +84,8 @@ class RoundSimulation:
         return self.driver.command(self.state, self.world.traffic, self.driven_m)
 
     def step(self, command: Command) -> None:
-        """One control step. After a collision or off the road, the car is reset onto the road.
+        """Do one control step. If the car then has collided, is off the road or drives backwards,
+        it is reset to the middle of the road.
 
         Raises RoundFailed after too many resets.
         """
@@ -115,15 +116,15 @@ class RoundSimulation:
 
 @dataclass(frozen=True, slots=True)
 class FrameTruth:
-    """Truth of a frame, before its image is rendered."""
+    """Everything that is recorded of a frame except its image, which `render` makes."""
 
     scenery: Scenery
     pose: NDArray[np.float64]
     frame: Frame
-    """Without its image."""
+    """The frame with an empty image."""
 
     def render(self, camera: Camera) -> NDArray[np.uint8]:
-        """The camera image, (height, width, 3) RGB."""
+        """Render the image of the frame, (height, width, 3) uint8 RGB."""
         camera.change_scene(*self.scenery)
         return camera.render(self.pose, self.frame.traffic)
 
@@ -156,7 +157,7 @@ def record_round(
 
 
 def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[FrameTruth]]:
-    """Simulate all frames of a round; yields them in batches of `BATCH_FRAMES`."""
+    """Simulate a round; yield its frames in batches of `BATCH_FRAMES`, without images."""
     suite = SensorSuite([s for s in STANDARD if s.name not in NOT_RECORDED])
     frames = simulation.plan.frames
     for start in range(0, frames, BATCH_FRAMES):
@@ -165,7 +166,7 @@ def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[Frame
 
 
 def scenery(plan: RoundPlan, number: int) -> Scenery:
-    """Seed, light and look of scene `number` (from 0) of a round; no two rounds share one."""
+    """Seed, light and look of scene `number` (from 0) of a round. No seed is used twice."""
     light = Light.named(plan.lights[number], np.random.default_rng([plan.seed, 2, number]))
     look = plan.varied.scenes[number] if plan.varied else None
     return plan.seed + number * SCENERY_SEED_STRIDE, light, look
@@ -181,7 +182,7 @@ def _track(name: str, tracks_dir: Path | None) -> Track:
 def open_simulation(
     plan: RoundPlan, tracks_dir: Path | None, make_law: MakeLaw | None = None
 ) -> Iterator[tuple[RoundSimulation, Camera]]:
-    """Create the simulation of a round at its start, and its camera.
+    """Yield the simulation of a round, at the round's start, and the camera on its car.
 
     Raises UserError for a track that is missing or changed, and without a renderer.
     """
@@ -223,7 +224,7 @@ def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
 def _next_frame(
     simulation: RoundSimulation, camera: Camera, suite: SensorSuite, number: int
 ) -> FrameTruth:
-    """Truth and command of frame `number`; afterwards the simulation is at the next frame."""
+    """Return frame `number` without its image, and advance the simulation to the next frame."""
     scene = simulation.scenery_at(number)
     camera.change_scene(*scene)
     world, now = simulation.world, simulation.state
@@ -268,7 +269,8 @@ def _readings(read: dict[str, Any]) -> SensorReadings:
 
 
 def track_lines(road: Road) -> dict[str, NDArray[np.float64]]:
-    """Markings and both edges of the asphalt along the whole lap by name, (N, 3) m each."""
+    """Markings and both edges of the asphalt along the whole lap, by name; each is (N, 3) in m in
+    the world frame."""
     count = int(np.ceil(road.track.length_m / TRACK_LINE_STEP_M))
     s = np.linspace(0.0, road.track.length_m, count + 1)
     places = {f"marking {i}": y for i, y in enumerate(road.markings_y.tolist())}

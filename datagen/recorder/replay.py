@@ -32,10 +32,11 @@ def replay(
     pixels: bool = False,
     on_replayed: OnReplayed = lambda name: None,
 ) -> tuple[list[str], list[str]]:
-    """Simulate up to `count` rounds, spread over the plan; returns their ids, and differences.
+    """Simulate up to `count` rounds again, spread over the plan. Returns their ids, and a line for
+    each difference from the files.
 
-    Labels and states must be equal in every byte; with `pixels` images too, which only the same
-    renderer reproduces. Raises UserError if a round cannot be simulated on this machine.
+    Labels and states must be equal in every byte. With `pixels` images must be equal too; only the
+    same renderer reproduces them. Raises UserError if a round cannot be simulated on this machine.
     """
     if count < 1:
         raise tf.UserError(f"--replay is {count}; give the number of rounds to simulate again")
@@ -50,7 +51,8 @@ def replay(
 def differences(
     entry: RoundPlan, path: Path, tracks_dir: Path | None, pixels: bool
 ) -> Iterator[str]:
-    """Differences between a recorded round and the simulation of its entry, one line per topic."""
+    """Yield a line for each topic in which the recorded round at `path` differs from a new
+    simulation of its plan entry."""
     index = open_round(path)
     recorded = {topic: index.messages[topic] for topic in (topics.LABELS, topics.EGO_STATE)}
     first: dict[str, int] = {}
@@ -92,7 +94,8 @@ def _same_image(index: RoundIndex, number: int, image: bytes) -> bool:
 
 
 def _recorded(folder: Path) -> list[RoundPlan]:
-    """Plan entries of the recorded rounds."""
+    """Plan entries of the recorded rounds. Raises DatasetError without a plan of the scripted
+    driver."""
     path = folder / PLAN_FILE
     states = read_states(folder)
     try:

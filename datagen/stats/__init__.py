@@ -1,1 +1,1 @@
-"""The statistics page of a dataset: distributions, balance, concerns and a contact sheet."""
+"""Writes the statistics page of a dataset: distributions, balance, warnings, sample frames."""

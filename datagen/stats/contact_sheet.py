@@ -1,4 +1,4 @@
-"""Contact sheet of a dataset: frames spread over its tracks and lights, with their true markings.
+"""Contact sheet of a dataset: sample frames of its tracks and lights, with their true markings.
 
 The markings are the recorded ones (topic /camera/front/annotations), in pixels.
 """
@@ -27,7 +27,7 @@ _GREEN = (40, 255, 80)
 
 @dataclass(frozen=True)
 class Card:
-    """A frame of the contact sheet."""
+    """A frame of the contact sheet, with a line about its round and a line with its labels."""
 
     image: Image
     """(2 H, 2 W, 3) uint8 RGB."""
@@ -36,7 +36,8 @@ class Card:
 
 
 def contact_sheet(dataset: Dataset, most: int = 24) -> Iterator[Card]:
-    """Up to `most` frames, one per round; rounds of tracks and lights not shown yet come first."""
+    """Yield up to `most` frames, one per round. Rounds with tracks and lights that have not been
+    shown yet come first."""
     chosen = _diverse_order(dataset.rounds)[:most]
     for place, number in enumerate(chosen):
         info = dataset.rounds[number]
@@ -46,7 +47,8 @@ def contact_sheet(dataset: Dataset, most: int = 24) -> Iterator[Card]:
 
 
 def _diverse_order(rounds: list[RoundInfo]) -> list[int]:
-    """The indices of all rounds; each next one shares the fewest properties with those before."""
+    """The indices of all rounds in an order in which each round shares as few properties as
+    possible with the rounds before it."""
     left, order = list(range(len(rounds))), list[int]()
     seen: dict[tuple[str, str | int], int] = {}
     while left:

@@ -1,4 +1,4 @@
-"""The HTML page of a dataset: distributions, balance, concerns and a contact sheet."""
+"""The statistics page of a dataset (HTML): distributions, balance, warnings, sample frames."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -17,17 +17,17 @@ from runtime.html import embed_jpeg, render
 from runtime.svg_charts import bars, histogram
 
 BALANCED_BY = ("track", "lanes", "trajectory", "traffic")
-"""Properties of a round whose frames are counted."""
+"""Properties of a round; the page has a bar chart of the frames by each of them."""
 MIN_CLASS_SHARE = 0.15
 MIN_ACTIVE_SHARE = 0.02
 SHARED_BY_SPLITS = ("track", "lanes", "light", "trajectory")
-"""Properties of a round whose values should occur in both splits."""
+"""Properties of a round. Each of their values should occur in both splits, train and test."""
 REQUIRED_SPLITS = ("train", "test")
-"""Splits that every dataset needs; `unseen` is collected on request, and differs on purpose."""
+"""Splits that every dataset needs. `unseen` is collected on request and has other tracks."""
 
 
 def page(dataset: Dataset) -> str:
-    """The page's HTML; it needs no other file."""
+    """Return the HTML of the page, which needs no other file."""
     statistics = describe(dataset)
     labels = dataset.select("all").labels
     splits = np.array([info.split for info in dataset.rounds])[labels.round]
@@ -93,7 +93,8 @@ def _histograms(by_split: dict[str, Labels]) -> Iterator[Markup]:
 
 
 def concerns(statistics: dict[str, Any], rounds: Iterable[RoundInfo]) -> list[str]:
-    """Warnings, from the `statistics` of `datagen.recording.statistics.describe` and the rounds."""
+    """Warnings about the dataset, one sentence each. `statistics` is the result of
+    `datagen.recording.statistics.describe`."""
     return [
         *_empty_splits(statistics),
         *_rare_labels(statistics),
@@ -126,7 +127,7 @@ def _rare_labels(statistics: dict[str, Any]) -> Iterator[str]:
 
 
 def _one_sided_properties(rounds: list[RoundInfo]) -> Iterator[str]:
-    """Values of a property that occur in one split and not in the other split."""
+    """Yield a warning for each property with values that occur in only one of train and test."""
     by_split = {s: [info for info in rounds if info.split == s] for s in REQUIRED_SPLITS}
     if not all(by_split.values()):
         return

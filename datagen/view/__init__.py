@@ -1,1 +1,1 @@
-"""A recorded round to look at: in Rerun, or as one page of HTML."""
+"""Shows a recorded round in Rerun or as an HTML page."""

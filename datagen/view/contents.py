@@ -1,4 +1,4 @@
-"""Contents of a round for viewers: images, markings, poses, boxes, and named series over time.
+"""Reads what viewers show of a round: images, markings, poses, boxes and series over time.
 
 Frames and units are the same as in the recording; absent values of a series are None.
 """
@@ -33,10 +33,8 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Series of one unit in one plot, scaled to `limits` or to the values.
-
-    `dots`: values may be absent, so they are not joined by lines.
-    """
+    """A plot of series with the same unit. Its axis has the range `limits`; None: fitted to the
+    values. With `dots` the values are not joined by lines, because some can be absent."""
 
     title: str
     unit: str
@@ -47,7 +45,8 @@ class Plot:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """`position` (3,) in m and `quaternion` (4,) x, y, z, w, of a frame in its parent."""
+    """Pose of a coordinate frame in its parent frame: `position` (3,) in m and `quaternion` (4,) in
+    the order x, y, z, w."""
 
     position: Points
     quaternion: Points
@@ -94,8 +93,8 @@ class Contents:
         return _plots(list(self.steps))
 
     def markings(self, number: int) -> list[Points]:
-        """True markings in the image, (k, 2) each, in px from the upper left corner of the
-        image."""
+        """True markings in image `number`: polylines (k, 2), x and y in px from the image's upper
+        left corner."""
         lines = self.steps.message(ANNOTATIONS, number).points
         return [np.array([(p.x, p.y) for p in line.points]).reshape(-1, 2) for line in lines]
 
@@ -103,15 +102,16 @@ class Contents:
         return " ".join(t.text for t in self.steps.message(ANNOTATIONS, number).texts)
 
     def pose(self, number: int, child: str = EGO) -> Pose:
-        """Pose of the car in the world, or of frame `child` in its parent."""
+        """Pose of the coordinate frame `child` in its parent at step `number`; by default, of the
+        car in the world. Raises DatasetError if it was not recorded."""
         for transform in self.steps.message(TRANSFORMS, number).transforms:
             if transform.child_frame_id == child:
                 return Pose(_vector(transform.translation), _quaternion(transform.rotation))
         raise DatasetError(f"{self.steps.index.path}: no transform of {child} in step {number}")
 
     def boxes(self, number: int, frame: str = WORLD) -> list[Box]:
-        """Boxes of the other cars in the world frame; with `frame` EGO, the box of the car
-        itself."""
+        """Boxes of the other cars in the world frame at step `number`. With `frame` EGO: the box of
+        the car itself."""
         entities = self.steps.message(TRAFFIC, number).entities
         return [
             Box(Pose(_vector(c.pose.position), _quaternion(c.pose.orientation)), _vector(c.size))
@@ -122,7 +122,7 @@ class Contents:
 
     @cached_property
     def scene(self) -> dict[str, Points]:
-        """Lines of the track in the world by name, (N, 3) m each."""
+        """Markings and edges of the track by name; each is (N, 3) in m in the world frame."""
         return {
             entity.id: np.array([(p.x, p.y, p.z) for line in entity.lines for p in line.points])
             for entity in self.steps.message(TRACK_SCENE, 0).entities

@@ -1,4 +1,4 @@
-"""A recorded round as one HTML page that needs no other file: images, plan view and plots in step.
+"""Shows a recorded round as one self-contained HTML page: images, map and plots at the same time.
 
 Positions are in m in the world frame, angles in rad, markings in pixels of the image.
 """
@@ -18,7 +18,8 @@ MAX_FRAMES = 500
 
 
 def page(contents: Contents, max_frames: int = MAX_FRAMES) -> str:
-    """The page's HTML; plots have every step, images are at most `max_frames`."""
+    """Return the HTML of the page. The plots have every step, but at most `max_frames` images are
+    shown."""
     count = len(contents.steps)
     shown = range(0, count, -(-count // max_frames))
     data = {
@@ -47,7 +48,7 @@ def _frame(contents: Contents, number: int) -> dict[str, Any]:
 
 
 def _planar_pose(pose: Pose) -> list[float]:
-    """x, y (m) and yaw (rad) in the world frame."""
+    """Position x, y (m) and yaw (rad) of `pose`, rounded."""
     x, y, z, w = pose.quaternion.tolist()
     yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return [round(float(pose.position[0]), 2), round(float(pose.position[1]), 2), round(yaw, 3)]
@@ -62,5 +63,5 @@ def _plot(plot: Plot) -> dict[str, Any]:
 
 
 def _flatten(points: Points, digits: int = 2) -> list[float]:
-    """Points (N, 2) as x, y, x, y, ..., rounded."""
+    """The points (N, 2) as a flat list x, y, x, y, ..., rounded to `digits` decimals."""
     return [float(value) for value in np.round(points, digits).ravel()]

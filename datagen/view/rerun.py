@@ -1,7 +1,7 @@
 """Converts a round to a Rerun recording: images with markings, the world in 3D, plots, and the
 viewer's layout.
 
-World frame as recorded, z up. Time is counted from the start of the round, s.
+The world frame is the recorded one, z up. Times are in s from the start of the round.
 """
 
 import re
@@ -23,7 +23,8 @@ TRAFFIC, TRACK, PLOTS = "world/traffic", "world/track", "plots"
 ABOUT, CAPTION = "about", "caption"
 GREEN, BLUE, GREY = (40, 255, 80), (51, 102, 255), (140, 140, 140)
 FROM_CORNER = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-"""Shift by half a pixel: Rerun counts pixels from the upper left corner of the image."""
+"""Matrix that shifts pixel coordinates by half a pixel: Rerun's origin is the upper left corner of
+the image, not the centre of its first pixel."""
 SERIES = ((59, 111, 212), (224, 122, 46), (47, 158, 92), (176, 64, 154), (136, 112, 32))
 
 
@@ -118,12 +119,13 @@ def _send(recording: rr.RecordingStream, entity: str, time: rr.TimeColumn, colum
 
 
 def plot_entity(plot: Plot) -> str:
-    """Path of the entity that holds the series of a plot."""
+    """Path of the Rerun entity that contains the series of a plot."""
     return f"{PLOTS}/{_entity_name(plot.title)}"
 
 
 def _entity_name(title: str) -> str:
-    """`title` without the characters that have a meaning in Rerun's entity paths."""
+    """`title` in lower case, with `_` for all characters but letters and digits: others have a
+    meaning in Rerun's entity paths."""
     return re.sub("[^a-z0-9]+", "_", title.lower())
 
 

@@ -28,7 +28,7 @@ class ShowConfig:
     port: int
 
     def validate(self) -> None:
-        """Raise UserError for impossible options, before anything is read."""
+        """Raise UserError for impossible options; called before the round is read."""
         if sum((self.html is not None, self.save is not None, self.web)) > 1:
             raise UserError("--html, --save and --web exclude each other; give one of them")
         for path in (self.html, self.save):
@@ -46,7 +46,10 @@ class ShowConfig:
 
 
 def show(contents: Contents, config: ShowConfig, on_shown: OnShown) -> None:
-    """Show a round. Raises UserError or OSError; KeyboardInterrupt when a server is stopped."""
+    """Show a round as the options in `config` require, and call `on_shown`.
+
+    Raises UserError or OSError, and KeyboardInterrupt when the user stops the web viewer.
+    """
     if config.html is not None:
         from datagen.view.html_page import page
 
@@ -88,7 +91,8 @@ def save(contents: Contents, path: Path) -> None:
 
 
 def _require_all_images(path: Path, frames: int) -> None:
-    """Raise ValueError unless all images are in the file: Rerun writes in the background."""
+    """Raise ValueError unless the file has all images: Rerun writes in the background and does not
+    report a failed write."""
     from rerun.chunk import RrdReader
 
     from datagen.view.rerun import IMAGE
@@ -134,7 +138,7 @@ def _require_rerun() -> None:
 
 
 def _require_screen() -> None:
-    """Raise UserError without a display: the viewer would end without a message."""
+    """Raise UserError if there is no display; the viewer itself would end without a message."""
     if sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         raise UserError(
             "there is no screen to open a window on; give --web, --save FILE.rrd or --html FILE"

@@ -1,4 +1,4 @@
-"""The frames of a round with their messages parsed; used by `datagen export` and `view`."""
+"""Reads the frames of a round with parsed messages, for `datagen export` and `datagen view`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ Value = float | int | str | list[float] | None
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Image and truth of one frame. `image` is the encoded image, not a copy."""
+    """One frame: image, labels, vehicle state and command. `image` is encoded and not copied."""
 
     number: int
     time_s: float
@@ -49,7 +49,8 @@ class Steps:
 
     @staticmethod
     def open(path: Path, topics: tuple[str, ...] = TOPICS) -> "Steps":
-        """Open a round. Raises DatasetError unless every image has label, state and command."""
+        """Open a round for reading `topics`. Raises DatasetError unless every image has a label, a
+        state and a command."""
         steps = Steps(open_round(path, topics))
         times = steps.index.messages[CAMERA].log_time
         for topic in TOPICS[1:]:
@@ -78,14 +79,14 @@ class Steps:
         return (self[number] for number in range(len(self)))
 
     def message(self, topic: str, number: int) -> Any:
-        """Message `number` of an opened topic, parsed. Raises DatasetError if it is damaged."""
+        """Parse message `number` of an opened topic. Raises DatasetError if it is damaged."""
         try:
             return MESSAGE_TYPES[topic].FromString(bytes(self.payload(topic, number)))
         except DAMAGE_ERRORS as error:
             raise self._damaged(topic, number, error) from error
 
     def payload(self, topic: str, number: int) -> memoryview:
-        """Bytes of message `number` of a topic."""
+        """The bytes of message `number` of a topic. Raises DatasetError if its chunk is damaged."""
         try:
             return self.index.messages[topic].payload(number)
         except DAMAGE_ERRORS as error:
@@ -113,7 +114,8 @@ class Steps:
 
 
 def values(message: Any) -> dict[str, Value]:
-    """Fields of a message by name: None where absent, enum values as lower-case names."""
+    """The fields of a protobuf message by name. Absent fields are None; enum values are lower-case
+    names."""
     return {f.name: _value(message, f) for f in message.DESCRIPTOR.fields}
 
 
