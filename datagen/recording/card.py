@@ -1,4 +1,4 @@
-"""Fills the dataset card `card.md`, which becomes `README.md` of a dataset folder.
+"""Fills in the template `card.md`; the result is the dataset card, `README.md` of the folder.
 
 Its YAML header is in the format of the Hugging Face hub: huggingface.co/docs/hub/datasets-cards.
 """
@@ -28,7 +28,8 @@ CODECS = {"jpeg": f"JPEG, quality {JPEG_QUALITY}, 4:2:0", "png": "PNG, lossless"
 
 
 def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
-    """Markdown with a YAML header; `statistics` is the result of `describe`."""
+    """The dataset card: Markdown with a YAML header. `statistics` is the result of
+    `datagen.recording.statistics.describe`."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)
     rounds, frames = statistics["rounds"], statistics["frames"]

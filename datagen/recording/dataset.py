@@ -1,4 +1,4 @@
-"""Reading a dataset folder: rounds, labels as arrays, images as uint8 batches.
+"""Reads a dataset folder: rounds, labels as arrays, images as uint8 batches.
 
 frames = Dataset.open("datasets/default").select("train")
 batch = frames.read_batch([3, 1, 2])
@@ -54,12 +54,13 @@ class Frames:
         camera: CameraParameters,
         rows: NDArray[np.int64] | None = None,
     ) -> None:
-        """`rows`: indices of the frames to use, ascending, counted over `rounds`; None: all."""
+        """`indexes` are the opened files of `rounds`. `rows`: ascending indices of the frames to
+        use, counted over all frames of `rounds`; None: all frames."""
         self.rounds = list(rounds)
         self.camera = camera
         self._images = [index.messages[CAMERA] for index in indexes]
         self._indexes = list(indexes)
-        # The number of the first frame of each round, and of the one after the last.
+        # Index of the first frame of each round, counted over all rounds; at the end the total.
         self._first = list(accumulate((len(images) for images in self._images), initial=0))
         self._rows = np.arange(self._first[-1]) if rows is None else rows
 
@@ -115,18 +116,18 @@ class Frames:
             raise self._undecodable(i, error) from error
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """The image of frame `i`, (H, W, 3) uint8 RGB; raises as `read_batch` does."""
+        """The image of frame `i`, (H, W, 3) uint8 RGB. Raises IndexError or UndecodableImage."""
         image: NDArray[np.uint8] = self.read_batch([i])[0]
         return image
 
     def read_batch(
         self, indices: Sequence[int] | NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """Decode the images of `indices` into `out` (B, H, W, 3) uint8 RGB, one thread per core.
+        """Decode the images of the frames `indices` (B,) on one thread per core.
 
-        Returns `out`, a new array if none is given. Raises IndexError for a frame that does not
-        exist, UndecodableImage for a damaged image (the rest of `out` is then undefined), and
-        ValueError if `out` has another shape or type.
+        Returns them as (B, H, W, 3) uint8 RGB: in `out`, or in a new array. Raises IndexError for a
+        frame that does not exist, UndecodableImage for a damaged image (the rest of `out` is then
+        undefined), and ValueError if `out` has another shape or type.
         """
         numbers = np.asarray(indices, dtype=np.int64)
         shape = (len(numbers), self.camera.height, self.camera.width, 3)
@@ -149,8 +150,8 @@ class Frames:
     def _decode(
         self, rows: Iterator[tuple[int, int]], out: NDArray[np.uint8]
     ) -> tuple[int, UndecodableImage] | None:
-        """Decode until `rows` ends or an image is damaged; return the damaged image's row and
-        error."""
+        """Decode images into `out` until `rows`, pairs (row of `out`, frame), ends or an image is
+        damaged. Returns the row and the error of the damaged image, else None."""
         for row, i in rows:
             try:
                 decode_into(self.jpeg(i), out[row])
@@ -161,7 +162,7 @@ class Frames:
         return None
 
     def _locate(self, i: int) -> tuple[int, int]:
-        """The round of frame `i`, as an index into `rounds`, and the frame's number in it."""
+        """The round of frame `i` (an index into `rounds`), and the frame's number in this round."""
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {len(self)}")
         row = int(self._rows[i])
@@ -194,9 +195,9 @@ class Dataset:
 
     @staticmethod
     def open(path: str | Path, split: str = DEFAULT_SPLIT) -> "Dataset":
-        """Open the rounds of a folder.
+        """Open the dataset in the folder `path` with the split `split`.
 
-        Raises DatasetError if there are none, a round is damaged, a merge has not ended, cameras
+        Raises DatasetError if it has no rounds, a round is damaged, a merge has not ended, cameras
         differ or the split leaks, and DefinitionsMismatch if a round was recorded under other
         label definitions.
         """
@@ -213,7 +214,8 @@ class Dataset:
         return Dataset(folder, rounds, _one_camera(indexes), content_hash, indexes)
 
     def select(self, side: str = "all") -> Frames:
-        """The frames of the rounds of one side of the split (train, test, unseen), or of all."""
+        """The frames of the rounds on one side of the split (train, test, unseen), or of all rounds
+        ("all"). Raises DatasetError if there are none."""
         if side not in (*SIDES, "all"):
             raise DatasetError(
                 f"there is no side {side!r} of a split; choose {', '.join(SIDES)} or all"
@@ -253,7 +255,8 @@ def _validate_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
-    """The common camera of all rounds (with camera jitter: the nominal one); else DatasetError."""
+    """The camera of the dataset: the camera of all rounds, without its jitter. Raises DatasetError
+    if the rounds have different cameras."""
     camera = indexes[0].header.dataset_camera
     for index in indexes:
         if index.header.dataset_camera != camera:

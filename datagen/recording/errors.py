@@ -10,7 +10,7 @@ class DatasetError(UserError):
 
 
 class UndecodableImage(DatasetError):
-    """Image `frame` of the round `round_id` is damaged; `reason` says how."""
+    """Image number `frame` of the round `round_id` cannot be decoded; `reason` is the cause."""
 
     def __init__(self, round_id: str, path: Path, frame: int, reason: str) -> None:
         super().__init__(

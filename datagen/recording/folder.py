@@ -1,7 +1,7 @@
 """The files of a dataset folder, and how a finished round is moved into it.
 
 A round is written under `.partial/`, read back, checked, hashed, synced and renamed into `rounds/`;
-`state/ID.json` then holds its hashes. All other files are derived from these (see `manifest`).
+`state/ID.json` then holds its hashes. `manifest.py` derives all other files from these.
 """
 
 import json
@@ -27,7 +27,7 @@ PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FIL
 
 @dataclass(frozen=True, slots=True)
 class RoundState:
-    """Size and hashes of a finished round file, to detect later changes."""
+    """Size and hashes of a finished round file; later changes of the file are detected by them."""
 
     id: str
     file: str
@@ -39,7 +39,8 @@ class RoundState:
 
     @staticmethod
     def of(path: Path, header: RoundHeader, result: RoundResult) -> "RoundState":
-        """State of the complete round file at `path`, which need not be in the dataset yet."""
+        """Compute the state of the complete round file at `path`; it can still be outside
+        `rounds/`."""
         return RoundState(
             id=header.id,
             file=f"rounds/{header.id}.mcap",
@@ -52,7 +53,7 @@ class RoundState:
 
     @staticmethod
     def read(path: Path) -> "RoundState":
-        """Raises DatasetError for a file that is no round state."""
+        """Read a file of `state/`. Raises DatasetError if it is no valid round state."""
         try:
             state = RoundState(**json.loads(path.read_text()))
             name = require_name(state.id, "round id")
@@ -64,7 +65,7 @@ class RoundState:
 
 
 def prepare(folder: Path) -> None:
-    """Make the subfolders and write the files that describe the messages."""
+    """Create the subfolders of a dataset and write the files that describe its messages."""
     for name in SUBFOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     package = files("datagen.recording.schema")
@@ -86,12 +87,12 @@ def is_unstarted(folder: Path, first_file: str) -> bool:
 
 
 def begin_merge(folder: Path) -> None:
-    """Mark that rounds are being added that the split does not list yet."""
+    """Mark the dataset: rounds are being added that its split does not list yet."""
     atomic_write(folder / MERGING, "", fsync=True)
 
 
 def end_merge(folder: Path) -> None:
-    """Remove the mark: the split lists all rounds."""
+    """Remove the mark of `begin_merge`, because the split lists all rounds now."""
     (folder / MERGING).unlink(missing_ok=True)
 
 
@@ -126,7 +127,7 @@ def _partial_home(folder: Path, round_id: str) -> Path:
 
 
 def partial_path(folder: Path, round_id: str) -> Path:
-    """Where to write an unfinished round: `round.mcap` in a new, empty folder of its own."""
+    """Create an empty folder for an unfinished round; return the path of `round.mcap` in it."""
     home = _partial_home(folder, round_id)
     shutil.rmtree(home, ignore_errors=True)
     home.mkdir(parents=True)
@@ -141,7 +142,7 @@ def publish(folder: Path, partial: Path, state: RoundState) -> None:
 
 
 def write_state(folder: Path, state: RoundState) -> None:
-    """Write the state of a round, synced."""
+    """Write the state of a round and wait until it is on the disk (fsync)."""
     write_if_changed(state_path(folder, state.id), json.dumps(asdict(state), indent=1) + "\n")
 
 
@@ -151,7 +152,7 @@ def discard_partial(folder: Path, round_id: str) -> None:
 
 
 def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
-    """Remove unfinished files of these rounds, left by a crash or an interruption."""
+    """Remove the unfinished files of these rounds that a crash or an interruption has left."""
     for round_id in round_ids:
         discard_partial(folder, round_id)
     with suppress(OSError):  # it does not exist, or other rounds are being written in it
@@ -159,7 +160,8 @@ def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
 
 
 def read_states(folder: Path) -> dict[str, RoundState]:
-    """States of the finished rounds by id: those whose file exists and has the stated size."""
+    """The states of the finished rounds by id. A round is left out if its file is missing or has
+    another size."""
     states = {}
     for path in sorted((folder / "state").glob("*.json")):
         state = RoundState.read(path)

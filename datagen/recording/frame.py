@@ -1,4 +1,4 @@
-"""One control step as it is recorded: the image, its labels and the state of the simulation.
+"""Dataclasses of one recorded frame: the image, its labels and the state of the simulation.
 
 World frame: x, y in the plane, z up, angles counter-clockwise, SI units.
 """
@@ -13,7 +13,8 @@ import trackfeatures as tf
 
 @dataclass(frozen=True, slots=True)
 class EgoState:
-    """Pose of the centre of gravity, velocities in the body frame (m, rad, m/s, rad/s)."""
+    """Pose of the car's centre of gravity (m, rad), its velocities in the body frame (m/s, rad/s),
+    and the share of the road within 30 m ahead that is in shadow."""
 
     x: float
     y: float
@@ -29,7 +30,8 @@ class EgoState:
 
 @dataclass(frozen=True, slots=True)
 class SensorReadings:
-    """The paper's sensors in the paper's units (speeds in km/h, rotation in rev/min)."""
+    """Readings of the paper's sensors in its units: distances in m, angle in rad, speeds in km/h,
+    engine rotation in rev/min, lap time in s, wheel spin in rad/s."""
 
     range: tuple[float, ...] = ()
     angle: float = 0.0
@@ -44,7 +46,7 @@ class SensorReadings:
 
 @dataclass(frozen=True, slots=True)
 class DriverCommand:
-    """Control inputs of the step: steer in [-1, 1], left positive; throttle and brake in [0, 1]."""
+    """The driver's command: steer in [-1, 1], left positive; throttle and brake in [0, 1]."""
 
     steer: float
     throttle: float
@@ -54,7 +56,8 @@ class DriverCommand:
 
 @dataclass(frozen=True, slots=True)
 class RoadPlace:
-    """Position of the car on the road: curvature in 1/m, `to_middle` and `s` in m."""
+    """Position of the car on the road: `lane_index` 0 is the leftmost lane; curvature in 1/m, left
+    positive; `to_middle` (left positive) and `s` in m."""
 
     lanes: int
     lane_index: int
@@ -65,9 +68,9 @@ class RoadPlace:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """`image` (H, W, 3) uint8 RGB; `traffic` (n, 6): x, y, z, roll, pitch, yaw of each other car.
-
-    `markings` are the visible lane markings as polylines in pixels, (k, 2) each.
+    """A recorded frame. `image` is (H, W, 3) uint8 RGB; `traffic` (n, 6) is x, y, z (m), roll,
+    pitch, yaw (rad) of the n other cars; `markings` are the visible lane markings as polylines
+    (k, 2) in pixels.
     """
 
     image: NDArray[np.uint8]

@@ -1,4 +1,4 @@
-"""Encoding and decoding of images: JPEG of quality 95 with 4:2:0 chroma, or lossless PNG."""
+"""Encodes and decodes images: JPEG of quality 95 with 4:2:0 chroma, or lossless PNG."""
 
 from struct import Struct
 
@@ -14,7 +14,7 @@ Buffer = bytes | memoryview
 
 
 def encode(image: NDArray[np.uint8], codec: str) -> bytes:
-    """`image` (H, W, 3) uint8 RGB as JPEG or PNG bytes."""
+    """Encode `image` (H, W, 3) uint8 RGB with `codec` ("jpeg" or "png"; other names give a PNG)."""
     if codec == "jpeg":
         import simplejpeg
 
@@ -31,8 +31,8 @@ def encode(image: NDArray[np.uint8], codec: str) -> bytes:
 def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
     """Decode a JPEG or PNG into `out` (H, W, 3) uint8 RGB, contiguous.
 
-    Raises ValueError for a damaged image, another format or another size. JPEG files give the
-    pixels that libjpeg-turbo decodes.
+    Raises ValueError for a damaged image, another format or another size. libjpeg-turbo decodes
+    JPEG files.
     """
     if data[:2] == JPEG_MAGIC:
         import simplejpeg
@@ -44,7 +44,7 @@ def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
     elif bytes(data[:4]) == PNG_MAGIC:
         import cv2
 
-        # OpenCV would allocate what the header declares, however much.
+        # OpenCV would allocate an image of any size that the header declares.
         _require_shape(_png_size(data), out)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
@@ -56,7 +56,7 @@ def decode_into(data: Buffer, out: NDArray[np.uint8]) -> None:
 
 
 def _png_size(data: Buffer) -> tuple[int, int]:
-    """(height, width) in the header of a PNG. Raises ValueError."""
+    """Read (height, width) in px from the header of a PNG. Raises ValueError if it is cut."""
     if len(data) < PNG_SIZE.size + PNG_SIZE_AT:
         raise ValueError("the PNG ends within its header")
     width, height = PNG_SIZE.unpack_from(data, PNG_SIZE_AT)

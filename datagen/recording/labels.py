@@ -1,4 +1,4 @@
-"""Labels of many frames as arrays, in the track frame and the units of `trackfeatures`."""
+"""Reads the labels of many frames as arrays, in the track frame and units of `trackfeatures`."""
 
 from dataclasses import dataclass, fields
 
@@ -12,25 +12,25 @@ from datagen.recording.schema.proto.driverview_pb2 import TrackFeatures, Vehicle
 from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS, steps_at
 
 NAN = float("nan")
-LABEL_VALUES, MOTION_VALUES = 13, 2  # of `_label_row`, `_motion_row`
+LABEL_VALUES, MOTION_VALUES = 13, 2  # lengths of the tuples of `_label_row` and `_motion_row`
 
 
 @dataclass(frozen=True)
 class Labels:
-    """One row per frame; `distances` are ml, mr, l, m, r in m, NaN where not active."""
+    """Labels of N frames; `distances` are ml, mr, l, m, r in m, NaN where absent."""
 
     distances: NDArray[np.float32]  # (N, 5)
-    angle: NDArray[np.float32]  # (N,) rad, as all below
+    angle: NDArray[np.float32]  # (N,), as all arrays below; rad
     heading: NDArray[np.int64]  # 0 left, 1 straight, 2 right
-    lanes: NDArray[np.int64]
-    lane_index: NDArray[np.int64]
+    lanes: NDArray[np.int64]  # number of lanes of the road
+    lane_index: NDArray[np.int64]  # 0 leftmost
     curvature: NDArray[np.float32]  # 1/m
     to_lane_centre: NDArray[np.float32]  # m, NaN where absent
     to_middle: NDArray[np.float32]  # m
-    s: NDArray[np.float32]  # m
+    s: NDArray[np.float32]  # m along the centre line
     speed: NDArray[np.float32]  # m/s along the body
-    shadow_fraction: NDArray[np.float32]
-    light: NDArray[np.str_]
+    shadow_fraction: NDArray[np.float32]  # share of the road within 30 m ahead in shadow
+    light: NDArray[np.str_]  # name of the light
     round: NDArray[np.int64]  # index into the rounds of these frames
 
     def __len__(self) -> int:
@@ -43,9 +43,10 @@ class Labels:
 def read_labels(
     index: RoundIndex, round_number: int, frames: NDArray[np.int64] | None = None
 ) -> Labels:
-    """Labels of `frames` of a round, None: of all; `round_number` fills the column `round`.
+    """Read the labels of the frames `frames` (N,) of a round; None: of all frames.
 
-    Raises DatasetError if an image has no label or state, or a label of `frames` is damaged.
+    `round_number` is the value of the column `round`. Raises DatasetError if an image has no label
+    or state, or a label of `frames` is damaged.
     """
     camera, labels, states = (index.messages[t] for t in (CAMERA, LABELS, EGO_STATE))
     count = len(camera)
@@ -87,7 +88,8 @@ def read_labels(
 
 
 def light_per_frame(index: RoundIndex) -> NDArray[np.str_]:
-    """The light (N,) of each frame of a round, from log times: a recovered round has gaps."""
+    """Name of the light (N,) at each frame of a round. It is computed from the log times, because
+    frames of a recovered round can be missing."""
     header = index.header
     frames = steps_at(index.messages[CAMERA].log_time, header.frequency_hz)
     stretch = header.stretch or int(frames.max(initial=0)) + 1

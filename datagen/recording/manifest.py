@@ -1,7 +1,7 @@
-"""The derived files of a dataset folder: manifest, split, statistics and dataset card.
+"""Writes the derived files of a dataset folder: manifest, split, statistics and dataset card.
 
-`manifest.json` lists the rounds with their metadata and hashes, and the hashes of other files. It
-can be computed again from the rounds, so damage in it is found.
+`manifest.json` lists the rounds with their metadata and hashes, and the hashes of other files.
+Verification computes it again from the rounds, and so finds damage in it.
 """
 
 import json
@@ -30,7 +30,7 @@ HASHED_FILES = (*PUBLISHED_FILES, "plan.json", "stats.json")
 
 
 def build_manifest(dataset: Dataset) -> dict[str, Any]:
-    """The content of the manifest; reads the states of the rounds and the published files."""
+    """Compute the content of `manifest.json` from the rounds, their states and the other files."""
     states = read_states(dataset.path)
     rounds = []
     for info, index in zip(dataset.rounds, dataset.indexes, strict=True):
@@ -62,7 +62,7 @@ def to_json(content: dict[str, Any]) -> str:
 
 
 def manifest_problems(folder: Path) -> Iterator[str]:
-    """The problems of the manifest, one line each; raises as `Dataset.open` does."""
+    """Yield the problems of `manifest.json`, one line each. Raises the errors of `Dataset.open`."""
     path = folder / MANIFEST
     remedy = "run the same `datagen collect` again to write it anew"
     if not path.is_file():
@@ -86,7 +86,8 @@ def manifest_problems(folder: Path) -> Iterator[str]:
 
 
 def rebuild(folder: Path, split: Split) -> dict[str, Any]:
-    """Write manifest, split, statistics and card from the rounds; returns the statistics."""
+    """Write `split`, and manifest, statistics and card computed from the rounds; return the
+    statistics."""
     write_split(split_path(folder), split)
     end_merge(folder)
     dataset = Dataset.open(folder)

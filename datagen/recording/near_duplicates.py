@@ -1,4 +1,4 @@
-"""Near-duplicate frames of two sides of a split: same track and light, nearly the same pose.
+"""Finds near-duplicate frames on two sides of a split: same track and light, similar pose.
 
 A test set with many near-duplicates of training frames measures memorisation.
 """
@@ -46,7 +46,8 @@ class NearPair:
 
 @dataclass(frozen=True, slots=True)
 class NearDuplicates:
-    """`near` of `frames` frames have a near-duplicate on the other side; `worst`: nearest pairs."""
+    """`near` of `frames` frames have a near-duplicate on the other side. `worst`: the up to
+    `MAX_LISTED` nearest pairs."""
 
     frames: int
     near: int
@@ -63,9 +64,9 @@ def find_near_duplicates(
     other: NDArray[np.bool_],
     tolerances: Tolerances,
 ) -> NearDuplicates:
-    """Near-duplicates of the frames in mask `side` (N,) among the frames in mask `other` (N,).
+    """Find near-duplicates of the frames in mask `side` (N,) among those in mask `other` (N,).
 
-    The start line is not bridged: a frame just before it and one just after it are far apart.
+    Pairs across the start line are not found, because `s` jumps there from the lap's length to 0.
     """
     near, partner = np.flatnonzero(side), np.flatnonzero(other)
     if not (near.size and partner.size):
@@ -85,8 +86,9 @@ def find_near_duplicates(
 def _scaled_poses(
     labels: Labels, rounds: Sequence[RoundInfo], tolerances: Tolerances
 ) -> NDArray[np.float64]:
-    """(N, 4): s, lateral offset and yaw, in units of their tolerances, and 10 times the number of
-    the scene (a combination of track, lanes and light), so that two scenes are far apart."""
+    """Poses (N, 4): s, lateral offset and angle, each in units of its tolerance, and 10 times the
+    number of the frame's combination of track, lanes and light, so that frames of two combinations
+    are far apart."""
     numbers: dict[tuple[str, int], int] = {}
     of_round = [numbers.setdefault((r.track, r.lanes), len(numbers)) for r in rounds]
     kinds, light = np.unique(labels.light, return_inverse=True)

@@ -40,10 +40,10 @@ class RoundHeader:
     traffic: int
     trajectory: str
     lights: tuple[str, ...]
-    """Light of each stretch of the round; repeated when there are more stretches."""
+    """Name of the light of each stretch of the round. After the last one they are repeated."""
     speed_kmh: float
     stretch: int = 0
-    """Frames with the same scenery and light; 0: the whole round."""
+    """Number of frames in a row with the same scenery and light; 0: the whole round."""
     frequency_hz: int = 20
     codec: str = "jpeg"
     plan_hash: str = ""
@@ -65,15 +65,15 @@ class RoundHeader:
     def label_camera(self) -> CameraParameters:
         """The camera that training assumes for the round's images.
 
-        On varied roads it is `camera`: the network's metres are scaled to the dataset's camera, and
-        so are the labels. With camera jitter it is the dataset's camera.
+        On varied roads it is `camera`: training scales the labels from it to the dataset's camera.
+        With camera jitter it is the dataset's camera, as if there were no jitter.
         """
         return self.camera if self.varied is not None else self.dataset_camera
 
     @property
     def line_offsets(self) -> LineOffsets:
-        """Lateral offsets in m of the lines of each marking (`trackfeatures.measure`); () without a
-        varied road."""
+        """For each marking, the offsets (m, left positive) of its leftmost and rightmost line from
+        its nominal position; () on the paper's roads."""
         if self.varied is None:
             return ()
         lines = [each["lines"] for each in self.varied["carriageway"]["markings"]]
@@ -81,7 +81,7 @@ class RoundHeader:
         return tuple((float(left["offset_m"]), float(right["offset_m"])) for left, right in ends)
 
     def validate(self) -> None:
-        """Raise ValueError for an impossible value, before anything is computed with it."""
+        """Raise ValueError for an impossible value, before other code uses it."""
         require_name(self.id, "round id")
         camera = self.camera
         if type(self.frequency_hz) is not int or self.frequency_hz < 1:
@@ -103,13 +103,14 @@ class RoundHeader:
 
     def to_metadata(self) -> dict[str, str]:
         values = asdict(self, dict_factory=stored)
-        if self.varied is None:  # the paper's roads are recorded as before there were others
+        if self.varied is None:  # keeps the bytes of rounds on the paper's roads as they were
             del values["varied"]
         return {name: json.dumps(value) for name, value in values.items()}
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, str]) -> "RoundHeader":
-        """Raises KeyError, TypeError or ValueError for metadata of another kind or version."""
+        """Read the record. Raises KeyError, TypeError or ValueError for metadata of another kind or
+        version."""
         values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items()}
         for name in ("camera", "nominal_camera"):
             if values[name] is not None:
@@ -141,9 +142,10 @@ class RoundResult:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """The record that `datagen recover` adds: the round has only the undamaged frames of `source`.
+    """The record `driverview.recovered`: the round has only the undamaged frames of `source`.
 
-    `lost` frames are missing, or more with `at_least`, where the original number is unknown.
+    `saved` frames are in the round and `lost` frames are missing. With `at_least`, more can be
+    missing, because the original number is unknown.
     """
 
     source: str
@@ -165,7 +167,7 @@ class Recovery:
 
 @dataclass(frozen=True, slots=True)
 class RoundInfo:
-    """A recorded round of an opened dataset; `split` is its side, empty for none."""
+    """A recorded round of an opened dataset. `split` is its side of the split, "" for none."""
 
     id: str
     seed: int
@@ -181,23 +183,23 @@ class RoundInfo:
     content_hash: str
     path: Path
     label_camera: CameraParameters = field(default_factory=CameraParameters)
-    """See `RoundHeader.label_camera`."""
+    """The camera that training assumes for the round's images."""
     line_offsets: LineOffsets = ()
-    """See `RoundHeader.line_offsets`."""
+    """Offsets (m) of the lines of each marking on a varied road; () on the paper's roads."""
 
     @property
     def light(self) -> str:
-        """The round's light in one word."""
+        """The name of the round's light; "changing" if there are several."""
         return summarize_lights(self.lights)
 
     @property
     def track_group(self) -> str:
-        """Group in which frames are counted: the track, or `random` for all random roads
-        (`random:7`)."""
+        """The name under which the round's frames are counted: the track, or `random` for every
+        random road (such as `random:7`)."""
         return "random" if self.track.startswith("random:") else self.track
 
     def values_of(self, name: str) -> tuple[str, ...]:
-        """The values of attribute `name` in this round: one track, but several lights."""
+        """The values of attribute `name` in this round: all its lights, else one value."""
         if name == "light":
             return self.lights
         return (self.track_group if name == "track" else str(getattr(self, name)),)

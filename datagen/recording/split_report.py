@@ -1,4 +1,4 @@
-"""Making and checking the split of a dataset, with its near-duplicates across sides."""
+"""Makes and checks the split of a dataset; counts near-duplicate frames across its sides."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +37,8 @@ class SplitConfig:
 
 @dataclass(frozen=True, slots=True)
 class SplitReport:
-    """A valid split: rounds and frames by side, and near-duplicates of training frames by side."""
+    """A valid split: numbers of rounds and frames by side, and near-duplicates of training frames
+    on each side. `made`: this command created the split."""
 
     path: Path
     made: bool
@@ -86,7 +87,8 @@ def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
 
 
 def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:
-    """The report of a split; DatasetError if a round, seed or content hash is on two sides."""
+    """Check a split and return its report. Raises DatasetError if a round, seed or content hash is
+    on two sides."""
     dataset = Dataset.open(folder, name)
     frames = dataset.select("all")
     sides = np.array([info.split for info in frames.rounds])
@@ -108,7 +110,7 @@ def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) 
 
 
 def format_report(report: SplitReport) -> str:
-    """The report as text: a line per side, its nearest pairs below it."""
+    """Format the report as text: a line for each side, with its nearest pairs below."""
     lines = [
         f"{report.path}{' (made)' if report.made else ''}: no round, seed or content on two sides"
     ]

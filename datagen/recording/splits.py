@@ -1,4 +1,4 @@
-"""Splits: which rounds train a model, which test it, and which are of unseen tracks.
+"""Splits: they assign rounds to training, testing, or testing on unseen tracks.
 
 A split is by round, never by frame. `splits/NAME.json` holds the ids of each side. No round, seed
 or content hash may be on two sides (a leak).
@@ -54,7 +54,8 @@ def split_path(folder: Path, name: str = DEFAULT_SPLIT) -> Path:
 
 
 def read_split(path: Path) -> Split:
-    """Raises DatasetError for a missing or damaged file, DefinitionsMismatch for an old one."""
+    """Read a split file. Raises DatasetError if it is missing or damaged, and DefinitionsMismatch
+    if it was written under other definitions."""
     try:
         found = json.loads(path.read_text())
         tf.require_version(str(found["definitions"]), str(path))
@@ -139,7 +140,7 @@ def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: 
         order = [groups[i] for i in rng.permutation(len(groups))]
     else:
         order = _order_by_track(groups, rng)
-    # Group n is a test group where n * test_share, rounded to the nearest whole number, increases.
+    # Group n is a test group if round(n * test_share) < round((n + 1) * test_share).
     # Rounding to the nearest treats both ends of the order alike.
     marks = [floor((n * test_share) + 0.5) for n in range(len(order) + 1)]
     chosen = [group for n, group in enumerate(order) if marks[n + 1] > marks[n]]
@@ -158,7 +159,8 @@ def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: 
 def _order_by_track(
     groups: list[list[RoundInfo]], rng: np.random.Generator
 ) -> list[list[RoundInfo]]:
-    """Groups sorted by track, shuffled within a track: evenly spaced picks cover all tracks."""
+    """The groups sorted by track, in random order within a track. Groups picked at even distances
+    from this list cover all tracks."""
     tracks: dict[str, list[list[RoundInfo]]] = defaultdict(list)
     for i in rng.permutation(len(groups)):
         tracks[groups[i][0].track].append(groups[i])

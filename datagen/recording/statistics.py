@@ -1,4 +1,4 @@
-"""Frame counts and label statistics of a dataset: the baseline for the errors of a model."""
+"""Computes frame counts and label statistics of a dataset, a baseline for a model's errors."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -36,9 +36,10 @@ def describe(dataset: Dataset) -> dict[str, Any]:
 
 
 def describe_labels(labels: Labels) -> dict[str, Any]:
-    """Statistics of `labels`; distances in m, angles in rad, speeds in km/h.
+    """Statistics of `labels`: distances in m, angles in rad, speeds in km/h.
 
-    `mean_deviation` is the mean absolute error of a constant prediction, the mean.
+    `mean_deviation` is the mean absolute error of always predicting the mean; `active` is the share
+    of frames in which a label is present.
     """
     if not len(labels):
         return {"frames": 0}

@@ -1,1 +1,1 @@
-"""Verification and recovery of recorded rounds and dataset folders."""
+"""Verifies recorded rounds and dataset folders, and recovers damaged rounds."""

@@ -1,7 +1,8 @@
 """Checks that recorded labels follow from the lateral offset recorded with them.
 
-Labels are read as float32. At the border of a measuring system or of a lane, rounding decides which
-one applies, so a label is right if it is right for some offset within TOLERANCE_M.
+Labels are rounded to float32. Near the limits of the in-lane and on-marking systems and of a lane,
+rounding decides which one applies. So a label is accepted if it is right for any offset within
+TOLERANCE_M of the recorded offset.
 """
 
 from collections.abc import Iterator
@@ -17,11 +18,12 @@ from trackfeatures.measurement import LineOffsets
 TOLERANCE_M = 1e-4
 SHIFTS_M = (0.0, -TOLERANCE_M, TOLERANCE_M)
 MAX_HEIGHT_M = 1.0
-"""Largest height of the centre of gravity above the road plane. Distances are measured from its
-foot on the road plane, but `to_middle` is recorded vertically below it. The two differ by the
-height times the tangent of the banking, which the roll angle shows; the suspension adds to the
-roll, and a jump to the height."""
+"""Largest height of the centre of gravity above the road plane, also in a jump. Distances are
+measured from the nearest point of the road plane (the foot), but `to_middle` is that of the centre
+of gravity itself. On a banked road the two differ by the height times the tangent of the banking;
+the car's roll angle is used for the banking."""
 FOOT_SLACK_M = 0.005
+"""Tolerance added to this difference, m."""
 
 _Lines = tuple[int, float, LineOffsets]
 """Number of lanes, their width in m, and line offsets as in `trackfeatures.measure`."""
@@ -34,9 +36,10 @@ def label_problems(
     lane_width_m: float,
     line_offsets: LineOffsets = (),
 ) -> Iterator[str]:
-    """Contradictions to the definitions in the labels of one round, one line per kind.
+    """Yield a line for each kind of contradiction between a round's labels and the definitions.
 
-    `roll` (N,): the car's roll, rad; it bounds the position of the car's foot on a banked road.
+    `roll` (N,) is the car's roll in rad. On a banked road it limits the lateral distance between
+    the centre of gravity and the nearest point of the road plane.
     """
     try:
         tf.check_lanes(lanes, lane_width_m)
@@ -58,12 +61,13 @@ def label_problems(
 
 
 def _distances_follow(labels: Labels, i: int, reach_m: float, road: _Lines) -> bool:
-    """Whether all distances of a frame belong to one foot within reach of the recorded offset."""
+    """Whether all distances of frame `i` follow from one lateral position that differs from the
+    recorded offset by at most `reach_m`."""
     offset, found = float(labels.to_middle[i]), labels.distances[i].astype(np.float64)
     if not np.isfinite(offset):
         return False
     gaps = found - _expected(offset, road)
-    if np.isnan(gaps).all():  # a limit of the measuring systems may lie between the two
+    if np.isnan(gaps).all():  # a limit of the two systems can lie between both positions
         feet = np.linspace(-reach_m, reach_m, 41)
     else:
         feet = np.array([0.0, np.nanmedian(gaps)])

@@ -1,6 +1,6 @@
-"""Recovery of a damaged round file: its intact frames are written as a new round, marked as such.
+"""Recovers a damaged round file: writes its intact frames as a new round, marked as recovered.
 
-A frame is intact if all its messages are: the image, its label and everything recorded with them.
+A frame is intact if all its messages are intact: image, label and all others of the same step.
 """
 
 import hashlib
@@ -47,7 +47,7 @@ Step = dict[str, FoundMessage]
 
 @dataclass(frozen=True, slots=True)
 class IntactFrames:
-    """Intact frames by number, in order, and the track scene if it was found."""
+    """The messages of the intact frames by frame number, ascending; the track scene if found."""
 
     steps: dict[int, Step]
     scene: FoundMessage | None
@@ -55,7 +55,8 @@ class IntactFrames:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """The result of `datagen recover`; its fields are the keys of `--json`."""
+    """The result of `datagen recover`: numbers of saved and lost frames. With `at_least`, more can
+    be lost. The fields are the keys of `--json`."""
 
     out: str
     saved: int
@@ -66,8 +67,8 @@ class Recovered:
 def recover(file: Path, out: Path | None = None) -> Recovered:
     """Write the intact frames of `file` to `out` (default: `default_out`); `file` is kept.
 
-    In the `rounds/` of a dataset it becomes a round of that dataset, marked as recovered. Raises
-    DatasetError if nothing can be saved or `out` cannot be used, and OSError.
+    If `out` is in `rounds/` of a dataset, it becomes a round of the dataset, marked as recovered.
+    Raises DatasetError if nothing can be saved or `out` cannot be used, and OSError.
     """
     target = default_out(file) if out is None else out
     data = file.read_bytes()
@@ -98,14 +99,15 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
 
 
 def default_out(file: Path) -> Path:
-    """The default output: beside `file`, or for a round of a dataset in the folder `recovered/`."""
+    """Default path of the recovered round: beside `file`, or in `recovered/` of the dataset if
+    `file` is one of its rounds."""
     if file.parent.name == ROUNDS:
         return file.parent.parent / "recovered" / file.name
     return file.with_name(f"{file.stem}.recovered.mcap")
 
 
 def find_intact_frames(data: bytes, frequency_hz: int) -> IntactFrames:
-    """All intact frames, before and after the damage."""
+    """Find all intact frames in the bytes of a round file, before and after the damage."""
     steps: dict[int, Step] = defaultdict(dict)
     scene = None
     for chunk in find_chunks(data):
@@ -145,7 +147,8 @@ def _require_free(target: Path, round_id: str) -> None:
 
 
 def _recovery(file: Path, data: bytes, intact: IntactFrames) -> Recovery:
-    """The original number of frames is in the result metadata, or in the state of the round."""
+    """Make the recovery record. The original number of frames is read from the result metadata, or
+    else from the state of the round."""
     saved = len(intact.steps)
     recorded = _recorded_frames(data)
     if not recorded and file.parent.name == ROUNDS:

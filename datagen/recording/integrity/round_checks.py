@@ -31,7 +31,10 @@ MAX_LISTED = 5  # problems of one kind in one round
 
 
 def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, list[str]]:
-    """Number of frames, and the problems, one line each; never raises for a bad file."""
+    """Check the round file at `path`; return its number of frames and its problems, one line each.
+
+    A damaged file raises no exception. Raises DatasetError for an unknown `level`.
+    """
     if level not in LEVELS:
         raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     try:
@@ -53,7 +56,7 @@ def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, 
 
 
 def describe_read_error(path: Path, error: OSError) -> str:
-    """One line for a file that cannot be read."""
+    """The line in a report for a file that cannot be read."""
     return f"{path} cannot be read ({error.strerror})"
 
 
@@ -96,7 +99,8 @@ def _full(index: RoundIndex, state: RoundState | None, checker: "_MessageChecker
 
 
 def _times(index: RoundIndex, found: Scan) -> Iterator[str]:
-    """Every per-step topic has one message per control step, at the log time of that step."""
+    """Yield a problem if a topic of every frame lacks a message, a message has a wrong log time, or
+    the log times of any topic do not increase."""
     frames, hertz = index.result.frames, index.header.frequency_hz
     clock = [topics.log_time_ns(step, hertz) for step in range(frames)]
     if index.recovery is not None:  # with gaps: compare with the image times instead
@@ -131,7 +135,8 @@ def _labels(index: RoundIndex) -> Iterator[str]:
 
 
 class _MessageChecker:
-    """Called for every message of a round: hashes images and labels; `deep`: decodes everything."""
+    """Checks each message of a round in `on_message`: it hashes images and labels and, with `deep`,
+    decodes every message and image."""
 
     def __init__(self, index: RoundIndex, *, deep: bool) -> None:
         self.content = hashlib.sha256()

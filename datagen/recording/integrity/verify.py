@@ -1,6 +1,6 @@
-"""Verification of a dataset folder: every round, the splits and the manifest.
+"""Verifies a dataset folder: every round, the splits and the manifest.
 
-A bad file is reported, never raised.
+A damaged file is reported as a problem and raises no exception.
 """
 
 import os
@@ -46,8 +46,8 @@ def verify(
 ) -> Report:
     """Check every round at `level` (quick, full or deep), the splits and the manifest.
 
-    One thread per core. `on_round_done` is called with the id of each checked round, on any thread.
-    Raises DatasetError for another level.
+    The rounds are checked on one thread per core. `on_round_done` is called with the id of each
+    checked round, on any of these threads. Raises DatasetError for another level.
     """
     if level not in LEVELS:
         raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
@@ -117,21 +117,21 @@ def _manifest_problems(folder: Path) -> Iterator[str]:
 
 
 def _missing_rounds(folder: Path) -> Iterator[str]:
-    """Rounds with a state but without a file."""
+    """Yield a problem for each round with a state but without a file."""
     for path in sorted((folder / "state").glob("*.json")):
         if not round_path(folder, path.stem).is_file():
             yield f"{path.stem}.mcap is missing: state/{path.name} lists it as recorded"
 
 
 def _unexpected_files(folder: Path) -> Iterator[str]:
-    """Files in `rounds/` that are no rounds."""
+    """Yield a problem for each file in `rounds/` that is no round."""
     for path in sorted((folder / "rounds").iterdir()):
         if path.suffix != ".mcap":
             yield f"{path} is no round (expected *.mcap); move it elsewhere"
 
 
 def _duplicate_rounds(rounds: list[RoundIndex]) -> Iterator[str]:
-    """Files with the name of another round, and rounds with equal content."""
+    """Yield a problem for each file with the name of another round, and for equal contents."""
     contents: dict[str, str] = {}
     for index in rounds:
         name, header = index.path.name, index.header

@@ -1,1 +1,1 @@
-"""Reading and writing MCAP files, below the level of frames and labels."""
+"""Reads and writes MCAP files: records, chunks, indexes and serialised messages."""

@@ -1,4 +1,4 @@
-"""The footer and summary section of an MCAP file: channels, chunks, metadata, message counts.
+"""Reads the footer and summary section of an MCAP file: channels, chunks, metadata, counts.
 
 The official reader builds an object for each of thousands of entries, which takes seconds for many
 rounds; a test compares both. Source of the format: mcap.dev/spec.
@@ -28,7 +28,7 @@ from datagen.recording.mcap.records import (
 
 @dataclass(frozen=True, slots=True)
 class ChunkIndex:
-    """File offsets of a chunk and of its message indexes, by channel."""
+    """File offset `start` of a chunk and file offsets of its message indexes, by channel."""
 
     start: int
     compression: str
@@ -37,7 +37,8 @@ class ChunkIndex:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """`channels`: number by topic; `metadata`: (start, end) by name; `counts`: by channel."""
+    """Summary of an MCAP file: channel numbers by topic, chunks, metadata records as (start, end)
+    in bytes by name, and message counts by channel."""
 
     channels: dict[str, int] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
@@ -71,7 +72,8 @@ def read_summary(view: memoryview) -> Summary:
 
 
 def read_metadata(view: memoryview, place: tuple[int, int]) -> dict[str, str]:
-    """The metadata record at `place` = (start, end); ValueError if there is none."""
+    """Read the metadata record at `place`, (start, end) in bytes. Raises ValueError if there is
+    none."""
     for opcode, at, _ in records(view, *place):
         if opcode == Opcode.METADATA:
             _, after = text(view, at)

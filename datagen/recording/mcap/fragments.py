@@ -1,6 +1,6 @@
-"""Finding the undamaged chunks and messages of a damaged MCAP file, without its index.
+"""Finds the undamaged chunks and messages of a damaged MCAP file, without its index.
 
-A chunk record holds its size three times and a CRC: where two of the sizes agree and the CRC is
+A chunk record holds its size three times, and a CRC. If two of the sizes agree and the CRC is
 right, the chunk is undamaged. Source: mcap.dev/spec (Chunk).
 """
 
@@ -29,7 +29,8 @@ MAX_DURATION_NS = 366 * 86_400 * topics.NANOSECONDS
 
 @dataclass(frozen=True, slots=True)
 class ChunkBytes:
-    """The messages of a chunk. `intact`: its CRC is right; else its end is cut or overwritten."""
+    """Bytes of the messages of a chunk. `intact`: the CRC is right; otherwise the chunk's end is
+    cut or overwritten."""
 
     data: memoryview
     intact: bool
@@ -37,7 +38,7 @@ class ChunkBytes:
 
 @dataclass(frozen=True, slots=True)
 class FoundMessage:
-    """A message found in a chunk; `step` is its sequence number, `log_time` in ns."""
+    """A message found in a chunk. `step` (its sequence number) is its frame; `log_time` in ns."""
 
     topic: str
     step: int
@@ -46,10 +47,10 @@ class FoundMessage:
 
 
 def find_chunks(data: bytes) -> Iterator[ChunkBytes]:
-    """All undamaged chunks and, after the last of them, the start of a chunk that was cut off.
+    """Yield all undamaged chunks and, after the last of them, the start of a chunk that is cut off.
 
-    A chunk with a wrong CRC that is followed by other chunks or by its index is left out: any byte
-    of it may be wrong.
+    A chunk with a wrong CRC that is followed by another chunk or by its index is left out, because
+    any of its bytes can be wrong.
     """
     view = memoryview(data)
     at, torn = 0, None
@@ -68,14 +69,15 @@ def find_chunks(data: bytes) -> Iterator[ChunkBytes]:
 
 
 def chunk_messages(chunk: ChunkBytes) -> Iterator[FoundMessage]:
-    """The messages of a chunk in file order; of a cut chunk only those certain to be complete."""
+    """Yield the messages of a chunk in file order; for a cut chunk, only messages that are
+    certainly complete."""
     found, cut = _parse_messages(chunk.data)
     # If other bytes follow the messages, they may have overwritten the end of the last one.
     yield from found if chunk.intact or cut else found[:-1]
 
 
 def find_metadata(data: bytes, name: str) -> dict[str, str] | None:
-    """The metadata record of that name, anywhere in `data`; None if it is missing or cut."""
+    """Find the metadata record called `name` anywhere in `data`; None if it is missing or cut."""
     at = data.find(LENGTH.pack(len(name)) + name.encode())
     if at < 0:
         return None
@@ -87,7 +89,8 @@ def find_metadata(data: bytes, name: str) -> dict[str, str] | None:
 
 
 def _chunk_size_and_crc(view: memoryview, at: int) -> tuple[int, int]:
-    """Size and CRC of the messages of an uncompressed chunk at `at`; size 0 if there is none."""
+    """Size (bytes) and CRC of the messages of the uncompressed chunk at byte `at`, as its record
+    states them; size 0 if there is no such record."""
     if at + CHUNK_HEAD > len(view):
         return 0, 0
     _, length = RECORD.unpack_from(view, at)
@@ -101,7 +104,7 @@ def _chunk_size_and_crc(view: memoryview, at: int) -> tuple[int, int]:
 
 
 def _has_message_index(view: memoryview, at: int) -> bool:
-    """Whether there is a message index record at `at`, as after every chunk."""
+    """Whether a message index record begins at byte `at`, as it does after every whole chunk."""
     if at + RECORD.size > len(view):
         return False
     opcode, length = RECORD.unpack_from(view, at)
@@ -109,7 +112,8 @@ def _has_message_index(view: memoryview, at: int) -> bool:
 
 
 def _parse_messages(data: memoryview) -> tuple[list[FoundMessage], bool]:
-    """The messages of `data`, and whether they go on to its end (False: other bytes follow)."""
+    """The complete messages at the start of `data`, and whether message records fill `data` to its
+    end (False: other bytes follow)."""
     names = list(topics.MESSAGE_TYPES)  # channel numbers follow this order, from 1
     found: list[FoundMessage] = []
     at = 0

@@ -1,8 +1,8 @@
-"""Opening a round: random access to the messages of its MCAP file.
+"""Opens a round: gives random access to the messages of its MCAP file.
 
 An uncompressed, indexed file is memory-mapped, and a message index is read as an array on first
-use. Any other file is read with the official reader, message by message. Both give the same
-`RoundIndex`, and both check the CRC of a chunk before a message of it is used.
+use. Any other file is read with the official reader, message by message. Both ways give the same
+`RoundIndex`, and both check the CRC of a chunk before one of its messages is used.
 """
 
 import errno
@@ -42,8 +42,8 @@ from datagen.recording.round_metadata import (
 )
 from datagen.recording.schema import topics
 
-# Exceptions of the official reader and this one on bytes that are not an MCAP file; MemoryError
-# comes from a damaged length.
+# Exceptions that the official reader and this module raise for bytes that are not an MCAP file;
+# MemoryError is the result of a damaged length.
 DAMAGE_ERRORS = (
     McapError, ValueError, KeyError, TypeError, IndexError, OverflowError, struct.error,
     MemoryError,
@@ -58,19 +58,19 @@ class Messages(Protocol):
 
     @property
     def log_time(self) -> NDArray[np.int64]:
-        """(N,) ns; simulated time plus `topics.EPOCH_NS`."""
+        """Log times (N,) in ns: simulated time plus `topics.EPOCH_NS`."""
 
     def payload(self, i: int) -> memoryview:
-        """The serialised message `i`.
+        """The serialised message number `i`.
 
-        Raises ValueError if its chunk is damaged, or the index points at something else.
+        Raises ValueError if its chunk is damaged, or the index does not point to a message.
         """
 
 
 class CheckedChunks:
-    """Which chunks of a memory-mapped file were found undamaged; each is read once per process.
+    """Checks the chunks of a memory-mapped file by their CRC, each undamaged chunk only once.
 
-    A CRC of 0 means that the writer computed none (mcap.dev/spec): the chunk is then not checked.
+    A CRC of 0 means that the writer computed none (mcap.dev/spec): then only sizes are checked.
     """
 
     def __init__(self, view: memoryview, summary: Summary) -> None:
@@ -88,7 +88,7 @@ class CheckedChunks:
 
 
 def _chunk_is_good(view: memoryview, start: int) -> bool:
-    """Whether sizes and CRC of the uncompressed chunk at `start` fit its messages."""
+    """Whether sizes and CRC in the uncompressed chunk at byte `start` fit its messages."""
     if start + CHUNK_HEAD > len(view):
         return False
     opcode, length = RECORD.unpack_from(view, start)
@@ -102,7 +102,7 @@ def _chunk_is_good(view: memoryview, start: int) -> bool:
 
 @dataclass(frozen=True)
 class MappedMessages:
-    """Messages in a memory-mapped file; a message index is read on first use."""
+    """Messages of one channel of a memory-mapped file; their index is read on first use."""
 
     view: memoryview
     summary: Summary
@@ -131,7 +131,8 @@ class MappedMessages:
 
     @cached_property
     def _table(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Log times, file offsets and chunk numbers, from the message index after each chunk."""
+        """Log times (N,) in ns, file offsets (N,) and chunk numbers (N,) of the messages, from the
+        message index after each chunk."""
         parts, starts, numbers, sizes = [], [], [], []
         for number, chunk in enumerate(self.summary.chunks):
             at = chunk.indexes.get(self.channel)
@@ -168,7 +169,7 @@ class MappedMessages:
 
 @dataclass(frozen=True)
 class LoadedMessages:
-    """Messages held in memory, of a file that is compressed or not indexed."""
+    """Messages of one topic in memory, for a file that is compressed or has no index."""
 
     log_time: NDArray[np.int64]
     payloads: Sequence[bytes]
@@ -184,7 +185,7 @@ class LoadedMessages:
 class RoundIndex:
     """An opened round: its metadata, and its messages by topic.
 
-    `messages` has the topics the round was opened for, by default `LABEL_READER_TOPICS`.
+    `messages` has only the topics for which the round was opened.
     """
 
     path: Path
@@ -198,7 +199,8 @@ class RoundIndex:
 
 
 def open_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
-    """Index topics of a recorded round; DatasetError if it is damaged or of another format."""
+    """Open a recorded round for reading the topics `topic_names`. Raises DatasetError if the file
+    is damaged or of another format."""
     try:
         return _map_round(path, topic_names) or _load_round(path, topic_names)
     except _NotARoundError as error:
@@ -230,7 +232,7 @@ class _OtherVersionError(ValueError):
 
 
 def _map_round(path: Path, topic_names: Sequence[str]) -> RoundIndex | None:
-    """The round, memory-mapped; None if the file is compressed or has no message index."""
+    """Memory-map the round; return None if the file is compressed or has no message index."""
     view = map_file(path)
     summary = read_summary(view)
     if not summary.chunks or any(c.compression or not c.indexes for c in summary.chunks):

@@ -1,4 +1,4 @@
-"""Memory-mapping of files without an open file descriptor, so that any number can be mapped.
+"""Maps files into memory without keeping a descriptor open, so that any number can be mapped.
 
 Python's own `mmap` keeps a duplicate of the descriptor for the lifetime of the map; mmap(2) does
 not need it. A file is unmapped when the last view of it is garbage-collected.
@@ -15,7 +15,7 @@ MAP_FAILED = ctypes.c_void_p(-1).value
 
 
 def map_file(path: Path) -> memoryview:
-    """All bytes of `path`, read-only and shared between processes.
+    """Map all bytes of `path` into memory, read-only and shared between processes.
 
     Raises OSError, or ValueError for an empty file. The file must not be truncated while the view
     exists: reading beyond its end kills the process (SIGBUS).
@@ -29,7 +29,7 @@ def map_file(path: Path) -> memoryview:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number), str(path))
     array = (ctypes.c_ubyte * size).from_address(address)
-    # Not at exit: other threads may still read, and the system unmaps everything then.
+    # Not unmapped at exit: other threads can still read, and the system unmaps everything itself.
     weakref.finalize(array, _libc().munmap, address, size).atexit = False
     return memoryview(array).cast("B").toreadonly()
 

@@ -1,4 +1,5 @@
-"""Protobuf wire format, for two cases where its library is slow: one field, and many points.
+"""Protobuf wire format, for two cases in which protobuf's library is slow: reading one field of a
+message, and writing many points.
 
 Source: protobuf.dev/programming-guides/encoding.
 """
@@ -16,14 +17,15 @@ DOUBLE_TAG_1, DOUBLE_TAG_2 = 1 << 3 | 1, 2 << 3 | 1
 
 
 def bytes_field(message: memoryview, number: int) -> memoryview:
-    """The length-delimited field with number `number`; ValueError if it is not there."""
+    """Content of the first length-delimited field with number `number` in `message`. Raises
+    ValueError if there is none."""
     for start, end in bytes_fields(message, number):
         return message[start:end]
     raise ValueError(f"the message is damaged: field {number} was not found")
 
 
 def bytes_fields(message: memoryview, number: int) -> Iterator[tuple[int, int]]:
-    """Start and end of each length-delimited field with number `number`, in order.
+    """Yield start and end (bytes) of each length-delimited field with number `number`, in order.
 
     Raises ValueError for a truncated message.
     """
@@ -61,7 +63,7 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
 
 
 def points_field(number: int, points: ArrayLike) -> bytes:
-    """`points` (N, 2) as the repeated foxglove.Point2 field `number`, which is below 16."""
+    """Encode `points` (N, 2) as the repeated field `number` (below 16) of type foxglove.Point2."""
     xy = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     fields = np.empty(len(xy), POINT2)
     fields["tag"], fields["length"] = number << 3 | 2, POINT2.itemsize - 2

@@ -26,9 +26,9 @@ CHUNK_HEAD = RECORD.size + CHUNK.size + LONG_LENGTH.size
 
 
 def records(view: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """(opcode, start, end of the content) of each record from `at` to `end`.
+    """Yield (opcode, start, end of the content) of each record from byte `at` to `end`.
 
-    Raises ValueError for a record that does not fit.
+    Raises ValueError for a record that reaches beyond `end`.
     """
     while at < end:
         if at + RECORD.size > end:
@@ -42,7 +42,7 @@ def records(view: memoryview, at: int, end: int) -> Iterator[tuple[int, int, int
 
 
 def text(view: memoryview, at: int) -> tuple[str, int]:
-    """The string at `at`, and the position after it."""
+    """Read the string at byte `at`; return it and the position after it."""
     (length,) = LENGTH.unpack_from(view, at)
     start = at + LENGTH.size
     if start + length > len(view):
@@ -51,7 +51,7 @@ def text(view: memoryview, at: int) -> tuple[str, int]:
 
 
 def text_map(view: memoryview, at: int) -> dict[str, str]:
-    """The map of strings at `at`."""
+    """Read the map from strings to strings at byte `at`."""
     (length,) = LENGTH.unpack_from(view, at)
     at += LENGTH.size
     end = at + length

@@ -1,6 +1,6 @@
-"""Checking a whole MCAP file in one pass: SHA-256, CRCs, and the index of every message.
+"""Checks a whole MCAP file in one pass: SHA-256, CRCs, and the index of every message.
 
-One chunk at a time is in memory. Source of the checksums: mcap.dev/spec (Chunk, DataEnd, Footer);
+Only one chunk is in memory at a time. Source of the CRCs: mcap.dev/spec (Chunk, DataEnd, Footer);
 a CRC of zero means that it was not computed.
 """
 
@@ -32,15 +32,15 @@ from datagen.recording.mcap.records import (
 from datagen.recording.mcap.records import text as read_text
 from datagen.recording.schema.topics import seconds
 
-# Called for every message with its topic, log time (ns) and payload.
 OnMessage = Callable[[str, int, memoryview], None]
+"""Called for every message with its topic, log time (ns) and payload."""
 READ_BYTES = 1 << 20
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 @dataclass
 class Scan:
-    """Result of a scan: `times` are log times (ns) by topic, in file order."""
+    """Result of a scan. `times` are the log times (ns) of the messages by topic, in file order."""
 
     sha256: str = ""
     size: int = 0
@@ -50,7 +50,8 @@ class Scan:
 
 
 def scan(path: Path, on_message: OnMessage) -> Scan:
-    """Read `path` once; damage is listed in `problems`. Raises OSError if it cannot be read."""
+    """Read the file at `path` once and check it; `problems` of the result lists its damage. Raises
+    OSError if it cannot be read."""
     with path.open("rb") as stream:
         return _Scanner(stream, path.stat().st_size, on_message).run()
 
@@ -62,7 +63,7 @@ class _Scanner:
         self._on_message = on_message
         self._digest = hashlib.sha256()
         self._at = 0
-        self._crc = 0  # of the current section
+        self._crc = 0  # CRC of the current section up to now
         self._topics: dict[int, str] = {}  # by channel
         self._entries: dict[
             int, list[int]
@@ -165,7 +166,7 @@ class _Scanner:
             self._found.problems.append(f"a message index at byte {start} does not match its chunk")
 
     def _end_chunk(self) -> None:
-        """If the file has message indexes, every channel of the last chunk must have had one."""
+        """Add a problem if a channel of the last chunk has no message index, but others have."""
         chunks = self._found.chunks
         if self._entries and chunks and any(chunk.indexes for chunk in chunks):
             self._found.problems.append(f"no message index for channels {sorted(self._entries)}")
@@ -187,6 +188,7 @@ class _Scanner:
 
 
 def decompressed(body: memoryview) -> memoryview:
-    """The messages of a compressed chunk. Raises what the official library raises."""
+    """The decompressed messages of the chunk record `body`. Raises the errors of the official
+    library."""
     stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))))
     return memoryview(stream.read(length))

@@ -1,4 +1,4 @@
-"""Writing one round as an MCAP file. The same frames give the same bytes on any machine."""
+"""Writes one round as an MCAP file. The same frames give the same bytes on any machine."""
 
 import hashlib
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ from datagen.recording.schema import messages, topics
 
 
 class RoundWriter:
-    """Writes frames one at a time; `finish` completes the file. A context manager, which closes it.
+    """Writes a round frame by frame; `finish` completes the file. A `with` block closes the file.
 
-    `scene`: named polylines of the track in the world frame, (N, 3) m each.
+    `scene`: polylines of the track by name, each (N, 3) in m in the world frame.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class RoundWriter:
         self._add(topics.TRACK_SCENE, start, track)
 
     def add(self, frame: Frame) -> None:
-        """Append one control step to all topics."""
+        """Append a frame: one message to each topic."""
         header = self.header
         time = topics.log_time_ns(self.frames, header.frequency_hz)
         stamp = messages.timestamp(time)
@@ -66,7 +66,8 @@ class RoundWriter:
         distance_m: float = 0.0,
         mean_speed_kmh: float = 0.0,
     ) -> RoundResult:
-        """Write the result and the index, and close the file. `distance_m` in m, speed in km/h."""
+        """Write the result (totals of the round) and the index, close the file, and return the
+        result."""
         result = RoundResult(
             frames=self.frames,
             content_hash=self._content.hexdigest(),
@@ -89,13 +90,14 @@ class RoundWriter:
         self._file.add(topic, time, self.frames, data)
 
 
-# Estimates for the chunk size: image bytes per pixel, and bytes per step of all other topics.
+# Estimates for the chunk size: image bytes per pixel, and bytes per frame of all other topics.
 BYTES_PER_PIXEL = {"jpeg": 0.5, "png": 1.8}
 OTHER_BYTES = 6_000
 
 
 class RoundFile:
-    """Writes serialised messages; `finish` completes the file. A context manager closes it."""
+    """Writes serialised messages to an MCAP file; `finish` completes the file. A `with` block
+    closes it."""
 
     def __init__(self, path: Path, header: RoundHeader) -> None:
         self._stream = path.open("wb")
@@ -110,7 +112,7 @@ class RoundFile:
         self.add_metadata(ROUND_METADATA, header.to_metadata())
 
     def add(self, topic: str, log_time: int, step: int, data: bytes | memoryview) -> None:
-        """Append one message of control step `step`."""
+        """Append the message `data` of frame `step`; `log_time` in ns."""
         channel = self._channels[topic]
         self._mcap.add_message(channel, log_time, bytes(data), publish_time=log_time, sequence=step)
 
@@ -124,7 +126,7 @@ class RoundFile:
         self._stream.close()
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without writing its index."""
         self._stream.close()
 
     def __enter__(self) -> "RoundFile":

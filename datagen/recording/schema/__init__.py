@@ -1,1 +1,1 @@
-"""Topics and messages of a recording, and the description of their fields."""
+"""Defines topics and messages of a recording and describes their fields."""

@@ -33,8 +33,8 @@ ABSENT_ON_MARKING = (
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """`low` and `high` limit a value (of a list: each of its values); `absent` is the reason why
-    an optional value may be unset."""
+    """Description of a recorded field. `low` and `high` are the limits of the value (in a list, of
+    each element); `absent` describes when an optional value is unset."""
 
     meaning: str
     unit: str = "1"

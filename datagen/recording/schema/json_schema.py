@@ -28,7 +28,8 @@ def schema_text() -> str:
 
 
 def json_schema() -> dict[str, Any]:
-    """One definition per message, one property per field, and the message of each topic."""
+    """The schema as a dict: one definition per message with one property per field, and the message
+    of each topic."""
     package = driverview_pb2.DESCRIPTOR.package
     own_types = {
         topic: kind.DESCRIPTOR.name

@@ -1,4 +1,4 @@
-"""Frames as protobuf messages: one function per topic, which returns the serialised message.
+"""Makes protobuf messages of frames: one function per topic returns the serialised message.
 
 World frame: x, y in the plane, z up; SI units, angles in rad, counter-clockwise.
 """
@@ -85,7 +85,8 @@ def lens_parameters(camera: CameraParameters) -> tuple[str, list[float]]:
 
 
 def annotations(frame: Frame, time: Timestamp) -> bytes:
-    """The lane markings as polylines (pixels) and one line of text with the labels."""
+    """The annotations of an image: the lane markings as polylines (pixels) and a line of text with
+    the labels."""
     message = ImageAnnotations(timestamp=time)
     for polyline in frame.markings:
         line = message.points.add()
@@ -152,7 +153,7 @@ def traffic(frame: Frame, time: Timestamp) -> bytes:
 
 
 def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> bytes:
-    """Named polylines in the world frame, (N, 3) m each."""
+    """The scene with the named polylines `lines`, each (N, 3) in m in the world frame."""
     message = SceneUpdate()
     for name, points in lines.items():
         entity = message.entities.add(id=name, frame_id=WORLD)

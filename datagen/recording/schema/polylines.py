@@ -1,7 +1,7 @@
-"""The markings recorded over an image: pixel polylines read back from its annotations.
+"""Reads the lane markings recorded with an image from its annotations, as polylines in pixels.
 
-Frame: pixels, a pixel's centre at whole numbers. Foxglove's annotations count from the upper left
-corner of the image instead; `CORNER_PX` is the difference.
+Whole numbers are the centres of pixels here. Foxglove's annotations count from the upper left
+corner of the image; `CORNER_PX` is the difference.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ CORNER_PX = 0.5
 
 
 def read_polylines(message: memoryview) -> list[NDArray[np.float64]]:
-    """The polylines (n, 2) of an ImageAnnotations message, in their order.
+    """The polylines of an ImageAnnotations message in their order, each (n, 2): x, y in pixels.
 
     Each point takes 20 bytes, and all points are read as one array instead of one protobuf object
     each. Raises ValueError when the message is damaged.
@@ -31,12 +31,12 @@ def _points(line: memoryview) -> NDArray[np.float64]:
     first = next(bytes_fields(line, POINTS), None)
     if first is None:
         return np.zeros((0, 2))
-    start = first[0] - 2  # its tag and length are a byte each
+    start = first[0] - 2  # tag and length of the point have one byte each
     found = np.frombuffer(line[start:], POINT2, (len(line) - start) // POINT2.itemsize)
     alike = (found["tag"] == TAG) & (found["length"] == POINT2.itemsize - 2)
     count = len(alike) if alike.all() else int(alike.argmin())
     after = start + count * POINT2.itemsize
-    if after < len(line) and line[after] == TAG:  # a coordinate of 0 is left out by protobuf
+    if after < len(line) and line[after] == TAG:  # protobuf leaves out a coordinate of 0
         return _slowly(line)
     return np.column_stack([found["x"][:count], found["y"][:count]]) - CORNER_PX
 

@@ -1,4 +1,4 @@
-"""Topics of a recording, their message types, and the common clock (ns)."""
+"""Topics of a recording, their message types, and the conversion of steps to log times (ns)."""
 
 from typing import Any
 
@@ -45,24 +45,25 @@ MESSAGE_TYPES: dict[str, Any] = {
 }
 EVERY_STEP = (CAMERA, ANNOTATIONS, LABELS, EGO_STATE, SENSORS, COMMAND, TRAFFIC, TRANSFORMS)
 
-# Simulated time 0 is 2020-01-01T00:00:00Z: viewers expect a date; a fixed one keeps files equal.
+# Log time of simulated time 0: 2020-01-01T00:00:00Z. Viewers expect a date; with a fixed date the
+# same round gives the same bytes.
 EPOCH_NS = 1_577_836_800_000_000_000
 NANOSECONDS = 1_000_000_000
 
 
 def log_time_ns(step: int, frequency_hz: int) -> int:
-    """Log time of control step `step`, ns since 1970."""
+    """Log time (ns since 1970) of frame `step` (from 0) of a round with `frequency_hz` frames/s."""
     return EPOCH_NS + step * NANOSECONDS // frequency_hz
 
 
 def steps_at(log_times: NDArray[np.int64], frequency_hz: int) -> NDArray[np.int64]:
-    """The control steps (N,) of log times (N,): the inverse of `log_time_ns`."""
+    """Numbers (N,) of the frames with the log times `log_times` (N,) in ns."""
     steps: NDArray[np.int64] = -(-(log_times - EPOCH_NS) * frequency_hz // NANOSECONDS)
     return steps
 
 
 def seconds(log_time: int) -> float:
-    """Simulated time since the start of the round, s."""
+    """Convert a log time (ns) to simulated time since the start of the round (s)."""
     return (log_time - EPOCH_NS) / NANOSECONDS
 
 
@@ -77,7 +78,7 @@ def schema_data(message_type: Any) -> bytes:
 
 
 def _collect(file: FileDescriptor, files: dict[str, FileDescriptor]) -> None:
-    """Add `file` to `files` after its dependencies, each once."""
+    """Add `file` to `files`, after its dependencies and unless it is already there."""
     if file.name in files:
         return
     for dependency in file.dependencies:
