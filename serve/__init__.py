@@ -1,1 +1,1 @@
-"""The perception service: one driver-view image in, track features out."""
+"""The perception service: clients send a driver-view image and receive its track features."""

@@ -1,4 +1,4 @@
-"""`python -m serve` runs the command `serve`."""
+"""Runs the command `serve` for `python -m serve`."""
 
 from serve.cli import main
 

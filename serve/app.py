@@ -46,7 +46,7 @@ DESCRIPTION = "One driver-view image in, track features out. Angles in rad, dist
 
 
 class Service:
-    """The ASGI application around one engine."""
+    """The ASGI application of one worker, which answers images with one engine."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""ASGI messages: the client of a request, its body, and a complete reply."""
+"""Reads the client's address and the body of an ASGI request, and sends a reply over ASGI."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
@@ -23,7 +23,7 @@ def client_address(scope: Scope) -> str:
 
 
 async def read_body(receive: Receive, take: Callable[[int], None]) -> bytes:
-    """The complete body; `take` is called with the size of each part in bytes.
+    """Receive the complete body of a request; `take` is called with the size of each part in bytes.
 
     Raises ClientDisconnectedError, and the errors of `take`.
     """
@@ -47,7 +47,7 @@ async def send_reply(send: Send, reply: Reply, protocol: str = "http") -> None:
 
 
 def without_body(send: Send) -> Send:
-    """`send` for answers to HEAD: the headers of GET, including Content-Length, without a body."""
+    """Wrap `send` for answers to HEAD: send the headers of a GET (with Content-Length), no body."""
 
     async def send_head(message: Message) -> None:
         await send({**message, "body": b""} if "body" in message else message)

@@ -18,9 +18,11 @@ MAX_CAMERAS = 64
 
 
 def read_cameras(options: Iterable[str], model: CameraParameters) -> dict[str, CameraParameters]:
-    """The cameras of `NAME=FILE` options; values that a file omits come from the model's camera.
+    """Read the cameras of the options `NAME=FILE`, by name. Values that a file omits come from the
+    model's camera `model`.
 
-    Raises UserError for a faulty option or file, and for a camera that sees too little.
+    Raises UserError for a faulty option or file, and for a camera whose images do not cover the
+    view of the model's camera.
     """
     found: dict[str, CameraParameters] = {}
     for option in options:

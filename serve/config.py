@@ -59,7 +59,8 @@ class ServiceConfig:
 
 
 def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
-    """The addresses and networks of `--trusted-proxy`. Raises UserError for anything else."""
+    """Return the values of `--trusted-proxy`. Raises UserError if one of them is neither an IP
+    address nor a network."""
     found = tuple(proxies)
     for proxy in found:
         try:
@@ -74,8 +75,8 @@ def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
 
 @lru_cache(4096)
 def network_of(address: str) -> str:
-    """An IPv4 address as it is, an IPv4-mapped IPv6 address as IPv4, and the /64 network of any
-    other IPv6 address: one client usually owns the whole /64."""
+    """Name of the client that an address belongs to: an IPv4 address itself (also of an IPv4-mapped
+    IPv6 address), or the /64 network of another IPv6 address, since a client usually owns a /64."""
     try:
         found = ip_address(address.partition("%")[0])
     except ValueError:

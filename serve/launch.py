@@ -62,7 +62,7 @@ async def _serve(
 
 
 def _cameras(options: tuple[str, ...], run: Path) -> dict[str, CameraParameters]:
-    """The cameras of `--camera`, checked against the model in folder `run`."""
+    """Read the cameras of `--camera`, and check them against the model in the folder `run`."""
     if not options:
         return {}
     from serve.cameras import read_cameras  # imported late: loading OpenCV delays the workers

@@ -50,16 +50,17 @@ class RayConfig:
 
 
 def _application(folder: str, limits: Limits) -> Service:
-    """The service of one replica; the replica accepts requests after this function returns."""
+    """Load the engine and create the service of a replica. The replica accepts requests after this
+    function returns."""
     engine = load_engine(Path(folder))
     warm_up(engine)
     return Service(engine, lambda _engine: None, limits, tracer=telemetry.tracer())
 
 
 def build(args: dict[str, Any]) -> ray_serve.Application:
-    """The Ray Serve application. Keys of `args`: `model` as for `serve`, resolved on this machine;
-    `replicas`; `token_file` (default: the token in $DRIVERVIEW_TOKEN); `hosts`, the host names that
-    are accepted without a token. Raises UserError.
+    """Build the Ray Serve application. Keys of `args`: `model` as for `serve`, found on this
+    machine; `replicas`; `token_file` (default: the token in $DRIVERVIEW_TOKEN); `hosts`, the host
+    names that are accepted if there is no token. Raises UserError.
     """
     unknown = set(args) - ARGUMENTS
     if unknown:
@@ -108,7 +109,7 @@ def run(config: RayConfig) -> None:
 
 
 def _connect() -> bool:
-    """Join the cluster at $RAY_ADDRESS, or start a local one; True if one was started."""
+    """Join the cluster at $RAY_ADDRESS, or start a local cluster and return True."""
     import ray
 
     quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}

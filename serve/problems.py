@@ -17,7 +17,7 @@ MEDIA_TYPE = "application/problem+json"
 
 @dataclass(frozen=True, slots=True, eq=False)  # compared by identity
 class ProblemType:
-    """A type of problem: its name in the type URI, its HTTP status, its title."""
+    """A type of problem: its name (the last part of the type URI), HTTP status and title."""
 
     name: str
     status: int
@@ -185,7 +185,8 @@ def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, An
 
 
 def with_error(content: dict[str, Any], path: str) -> dict[str, Any]:
-    """The members of a problem at `path`; below /v2 with `error` (Open Inference Protocol)."""
+    """`content`, the members of a problem; for a `path` below /v2 also with the member `error`,
+    which the Open Inference Protocol requires."""
     if path == "/v2" or path.startswith(("/v2/", "/v2?")):
         return {**content, "error": content["detail"]}
     return content

@@ -28,7 +28,7 @@ class Reply(NamedTuple):
 
 
 def problem_reply(problem: Problem, *headers: Header, path: str = "") -> Reply:
-    """The reply with the problem of a request for `path`, with additional `headers`."""
+    """The reply to a request for `path` that states `problem`, with additional `headers`."""
     fields = (problem.type, problem.detail, problem.retry_after_ms)
     own_headers, body = _encode_problem(*fields, path[:4])
     return Reply(problem.type.status, [*own_headers, *headers], body)

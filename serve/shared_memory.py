@@ -75,7 +75,7 @@ class SharedMemory:
 
 
 def create_shared_memory(blocks: int) -> SharedMemory:
-    """New zeroed memory; child processes inherit its descriptor."""
+    """Create zeroed memory with `blocks` worker blocks; child processes inherit its descriptor."""
     if hasattr(os, "memfd_create"):
         fd = os.memfd_create("driverview-serve", 0)
     else:  # not Linux: use an unlinked file
@@ -87,7 +87,7 @@ def create_shared_memory(blocks: int) -> SharedMemory:
 
 
 def attach_shared_memory(fd: int, blocks: int) -> SharedMemory:
-    """The shared memory of an inherited descriptor."""
+    """Map the shared memory with `blocks` worker blocks that has the inherited descriptor `fd`."""
     return SharedMemory(fd, blocks, mmap.mmap(fd, _size_bytes(blocks)))
 
 

@@ -36,7 +36,7 @@ class SupervisorConnection:
         self._lock = threading.Lock()
 
     def lines(self) -> Iterator[str]:
-        """The supervisor's messages, until it closes the socket."""
+        """Yield the supervisor's messages (lines of JSON) until it closes the socket."""
         # Not a buffered file: at interpreter exit it would wait for the thread that reads it.
         rest = b""
         while received := self._socket.recv(65536):
@@ -91,8 +91,8 @@ def main() -> None:
 
 
 def load(folder: Path, expected: str | None) -> Engine:
-    """The engine of the run in `folder`. Raises UserError, also if its weights do not have the hash
-    `expected`."""
+    """Load the engine of the run in `folder`. Raises UserError if that fails, or if its weights do
+    not have the hash `expected`."""
     engine = load_engine(folder)
     found = engine.card.model_hash
     if expected is not None and found != expected:

@@ -22,7 +22,7 @@ HTTP_1_0 = "1.0"
 
 
 class Access:
-    """The checks of every request, before anything else is done for it."""
+    """Checks every request before the service does any other work for it."""
 
     def __init__(
         self,
@@ -50,7 +50,8 @@ class Access:
         return None
 
     def scope_refusal(self, scope: Scope) -> Reply | None:
-        """Like `refusal`, for any path, and for headers in which a name can occur twice."""
+        """The refusal of a request for any path, from its ASGI scope; None if it is accepted. A
+        header name can occur twice."""
         path, headers, client = scope["path"], dict(scope["headers"]), client_address(scope)
         try:
             public = _is_public(path)

@@ -43,7 +43,8 @@ def add_console(app: FastAPI) -> None:
 
 
 def docs_page(app: FastAPI) -> str:
-    """The HTML of `/docs`. It includes the OpenAPI document: /openapi.json can require a token."""
+    """The HTML of `/docs`. The page contains the OpenAPI document, because /openapi.json can
+    require a token."""
     document = json.dumps(app.openapi()).replace("<", "\\u003c")
     return (FOLDER / "docs.html").read_text(encoding="utf-8").replace("{{openapi}}", document)
 

@@ -1,4 +1,4 @@
-"""POST /features, from the headers of a request to its reply; `serve.api.schemas` has the JSON.
+"""Handles POST /features from the headers to the reply; `serve.api.schemas` defines the answer.
 
 `serve.server.fast_path` creates a `FeaturesRequest` for each request, and `serve.api.features_asgi`
 does so under ASGI. All endpoints for images use `FrameHandler`.
@@ -85,7 +85,7 @@ class ImageCamera:
 
 
 class FrameHandler:
-    """The handling of a frame for all endpoints: queue it, count its result, log it."""
+    """Handles the frames of all endpoints: queues them, counts and logs their results."""
 
     def __init__(
         self,
@@ -146,7 +146,8 @@ class FrameHandler:
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
     ) -> dict[str, Any]:
-        """The answer for an image file, a `schemas.Features`. Raises Problem, ImageError."""
+        """The answer to the image file in `body`, a dict with the members of `schemas.Features`.
+        Raises Problem, ImageError."""
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         crop = self.submit(options, body, client, partial(resolve, future))
         del body
@@ -160,10 +161,8 @@ class FrameHandler:
     async def predict_pixels(
         self, options: RequestOptions, client: str, read: PixelReader, read_ms: float
     ) -> FrameResult:
-        """The result for the pixels that `read` returns in about `read_ms`.
-
-        Raises Problem, ImageError.
-        """
+        """The result for the pixels that `read` returns; `read_ms` is the estimated time it takes.
+        Raises Problem, ImageError."""
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         frame = _frame(options, client, read, read_ms, False, self.image_camera(options))
         self.queue.submit(frame, partial(resolve, future))
@@ -193,7 +192,7 @@ class FrameHandler:
             self.tracer.record_answer(span, *about, result)
 
     def record_refusal(self, error: Problem | ImageError, request_id: str, client: str) -> Problem:
-        """Count and log an error; returns the problem for the reply."""
+        """Count and log the error of a request; return the problem for the reply."""
         forget_frames(error)
         problem = as_problem(error)
         self.record_problem(problem, request_id, client)
@@ -260,7 +259,7 @@ class FeaturesRequest:
         return True
 
     def submit(self, body: bytes) -> None:
-        """Queue the complete body."""
+        """Queue the image in the complete `body`; an error is sent as the reply."""
         try:
             self._crop = self._frames.submit(self._options, body, self._client, self._on_result)
         except (Problem, ImageError) as error:
@@ -270,7 +269,7 @@ class FeaturesRequest:
             self.refuse(internal_error())
 
     def refuse(self, error: Problem | ImageError) -> None:
-        """Reply with the problem of an error."""
+        """Reply with the problem of `error`."""
         self._share.close()
         forget_frames(error)
         self._send_problem(as_problem(error))
@@ -334,7 +333,7 @@ def _frame(
 def response_content(
     options: RequestOptions, result: FrameResult, crop: list[int] | None
 ) -> dict[str, Any]:
-    """The answer. For speed it is validated against the schema only in the tests."""
+    """The members of the answer. For speed, only the tests validate them against the schema."""
     return {
         **result.prediction.as_json(),
         **result.provenance,

@@ -81,7 +81,7 @@ logger = logging.getLogger(__name__)
 
 
 def add_kserve(app: FastAPI, frames: FrameHandler) -> None:
-    """Add the protocol's paths to `app`."""
+    """Add the paths of the Open Inference Protocol to `app`."""
     not_ready = problem_responses(NOT_READY)
     responses = {**OPERATION["responses"], **problem_responses(*REFUSALS)}
     extra = {
@@ -209,7 +209,7 @@ async def _answer(
 async def _pixel_reader(
     request: InferRequest, binary: memoryview, frames: FrameHandler, source: ImageCamera
 ) -> tuple[PixelReader, float]:
-    """A function that reads the input's pixels, and the estimate of its time in ms.
+    """Check a request and return a function that reads its pixels, with the estimated time in ms.
 
     Raises Problem, ImageError.
     """
@@ -234,7 +234,7 @@ async def _pixel_reader(
 
 
 def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:
-    """The output tensors by name, each (1, n)."""
+    """The output tensors of a prediction by name, each (1, n) float32; NaN if absent."""
     rows: dict[str, list[float | None]] = {
         "distances_m": [prediction.distances_m[name] for name in tf.MARKINGS],
         "to_lane_centre_m": [prediction.to_lane_centre_m],

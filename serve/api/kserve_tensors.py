@@ -60,7 +60,7 @@ class _Misplaced(msgspec.Struct, kw_only=True):
 
 
 class RequestedOutput(msgspec.Struct):
-    """A requested output."""
+    """An output that the client requests, with its parameters."""
 
     name: str
     parameters: dict[str, Any] = {}
@@ -104,7 +104,7 @@ class _RawRequest(_Misplaced):
 
 
 def read_json_length(body: bytes, header: bytes | None) -> int:
-    """The size of the JSON part of a body in bytes. Raises Problem."""
+    """Size of the JSON part of `body` in bytes: `header`, or the whole body. Raises Problem."""
     if header is None:
         return len(body)
     usable = header.isdigit() and len(header) <= MAX_LENGTH_DIGITS
@@ -114,8 +114,8 @@ def read_json_length(body: bytes, header: bytes | None) -> int:
 
 
 def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
-    """The decoded JSON part (the first `length` bytes) and the binary part of a request.
-    Raises Problem."""
+    """Decode the JSON part of a request, the first `length` bytes of `body`; return it and the
+    remaining, binary part. Raises Problem."""
     text, values = np.frombuffer(body, np.uint8, length), 0
     for start in range(0, length, COUNT_BYTES):
         part = text[start : start + COUNT_BYTES]
@@ -133,7 +133,7 @@ def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
 
 
 def _parse_json(text: memoryview) -> InferRequest:
-    """The request in JSON. Raises Problem, msgspec.DecodeError, RecursionError."""
+    """Decode the JSON part of a request. Raises Problem, msgspec.DecodeError, RecursionError."""
     raw = msgspec.json.decode(text, type=_RawRequest)
     (tensor,) = raw.inputs
     raw.check()
@@ -153,7 +153,7 @@ def _parse_json(text: memoryview) -> InferRequest:
 
 
 def _outputs(raw: msgspec.Raw) -> list[RequestedOutput]:
-    """The requested outputs. Raises Problem, msgspec.DecodeError."""
+    """Decode and check the requested outputs. Raises Problem, msgspec.DecodeError."""
     outputs = _small(raw, list[RequestedOutput])
     for output in outputs:
         where = f"parameters of {output.name[:40]}"
@@ -163,7 +163,7 @@ def _outputs(raw: msgspec.Raw) -> list[RequestedOutput]:
 
 
 def _parameters(raw: msgspec.Raw, known: dict[str, str], where: str) -> dict[str, Any]:
-    """The parameters in `where`. Raises Problem, also for a parameter that is not `known`."""
+    """Decode parameters; `where` names them in messages. Raises Problem, also for unknown names."""
     _check_small(raw)
     found = parse_json_object(bytes(raw), where)
     if found is None:
@@ -179,7 +179,7 @@ def _check_flag(parameters: dict[str, Any], name: str, where: str) -> None:
 
 
 def take_options(request: InferRequest) -> dict[str, Any]:
-    """The image's options among the parameters of a request."""
+    """The parameters of a request that are options of its image."""
     return {name: value for name, value in request.parameters.items() if name in OPTIONS}
 
 
@@ -197,7 +197,7 @@ def _small(raw: msgspec.Raw, kind: type[T]) -> T:
 
 
 async def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
-    """The image file in a BYTES tensor with one element (base64 in JSON). Raises Problem."""
+    """Read the image file in a BYTES tensor with one element (base64 in JSON). Raises Problem."""
     if tensor.datatype != "BYTES" or tensor.shape not in ([1], [1, 1]):
         raise invalid_request(
             f"{tensor.name} is {tensor.datatype[:20]} {tensor.shape[:8]}; it must be BYTES [1, 1]"
@@ -211,9 +211,9 @@ async def read_image_bytes(tensor: Tensor, binary: memoryview) -> bytes:
 
 
 async def _read_base64(tensor: Tensor) -> bytes:
-    """The decoded base64 string, which can be nested in lists. Raises Problem.
+    """Decode a base64 string, which can be nested in lists. Raises Problem.
 
-    It is decoded in windows; other tasks run between them.
+    It is decoded in parts of `WINDOW_BYTES`, so that other tasks can run in between.
     """
     data, start = tensor.data, tensor.data.find(b'"')
     end = data.rfind(b'"') + 1
@@ -252,7 +252,7 @@ class Pixels:
 
 
 def find_pixels(tensor: Tensor, binary: memoryview) -> Pixels:
-    """The UINT8 tensor of a request, without a leading 1 of its shape. Raises Problem."""
+    """Check the UINT8 tensor of a request; a leading 1 of its shape is ignored. Raises Problem."""
     shape = tensor.shape[1:] if len(tensor.shape) == 4 and tensor.shape[0] == 1 else tensor.shape
     usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0 and max(shape) < MAX_SIDE
     if tensor.datatype != "UINT8" or not usable:
@@ -284,9 +284,9 @@ def _shaped(
 
 
 def _read_json(name: str, text: bytes) -> bytearray:
-    """The integers of nested lists, flattened. Raises Problem.
+    """Decode nested lists of integers in JSON to their flat values. Raises Problem.
 
-    Decoded in windows: msgspec holds the GIL, and a long list would delay the event loop.
+    They are decoded in parts of `WINDOW_BYTES`: msgspec holds the GIL, which delays the event loop.
     """
     flat = text.translate(None, b"[]" + BLANKS)
     values, start = bytearray(), 0
@@ -319,8 +319,8 @@ def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
 def encode_response(
     head: dict[str, Any], tensors: dict[str, NDArray[np.float32]], request: InferRequest
 ) -> tuple[bytes, int | None]:
-    """The body of the answer, and the size of its JSON part in bytes (None if all of it is JSON).
-    Raises Problem."""
+    """Encode the body of the answer. Returns it and the size of its JSON part in bytes, None if the
+    whole body is JSON. Raises Problem."""
     requested = request.outputs or [RequestedOutput(name) for name in tensors]
     default = request.parameters.get(ALL_BINARY, False)
     outputs, parts = [], []

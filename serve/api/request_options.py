@@ -172,7 +172,8 @@ def parse_query(query: bytes) -> dict[str, str]:
 
 
 def single_options(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
-    """The pairs as a dictionary. Raises Problem if a name occurs twice."""
+    """The pairs (name, value) of options as a dictionary. Raises Problem if a name occurs twice;
+    `where` is the source of the options, for the message."""
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
@@ -212,7 +213,8 @@ def check_names(options: Mapping[str, Any], known: Mapping[str, Any], where: str
 
 
 def parse_json_object(text: str | bytes, where: str) -> dict[str, Any] | None:
-    """The JSON object in `text`, None for other text. Raises Problem if a name occurs twice."""
+    """Parse the JSON object in `text`; None for other text. Raises Problem if a name occurs twice;
+    `where` is the text's origin, for the message."""
     try:
         content = json.loads(text, object_pairs_hook=lambda pairs: single_options(pairs, where))
     except (ValueError, RecursionError):
@@ -223,7 +225,7 @@ def parse_json_object(text: str | bytes, where: str) -> dict[str, Any] | None:
 def parse_options(
     headers: Headers, stamp_ns: int, request_id: str, formats: Formats = FORMATS
 ) -> RequestOptions:
-    """The options in the headers of a request. Raises Problem."""
+    """Parse the options in the headers of a request that began at `stamp_ns`. Raises Problem."""
     for name in headers:
         if name.startswith(OPTION_HEADERS) and name not in HEADER_KEYS:
             seen = f"the request has an unknown header {name[:40].decode('latin-1')!r}"
@@ -241,7 +243,7 @@ def parse_options(
 
 
 def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFormat:
-    """The format of the answer. Raises Problem."""
+    """The format of the answer that the value of the Accept header requests. Raises Problem."""
     if accept is None or accept == b"*/*":
         return formats[0]
     if len(accept) > MAX_ACCEPT:
@@ -251,7 +253,7 @@ def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFo
 
 
 def parse_name(sent: bytes | None, header: str) -> str | None:
-    """The value of a header that contains a name; None without the header. Raises Problem."""
+    """Check the value `sent` of a header with a name or id; None without it. Raises Problem."""
     if sent is None:
         return None
     if not is_name(sent):
@@ -276,7 +278,8 @@ def request_id_of(headers: Headers) -> str:
 
 
 def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
-    """The time in ns of a deadline that is given in ms after `stamp_ns`. Raises Problem."""
+    """Convert a deadline, sent in ms after `stamp_ns`, to ns of the monotonic clock. Raises
+    Problem."""
     if sent is None:
         return None
     wait_ms = _parse_number(sent, DEADLINE, 0.0, MAX_DEADLINE_MS)
@@ -284,7 +287,7 @@ def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
 
 
 def parse_fov_deg(sent: bytes | str | None) -> float | None:
-    """The vertical field of view of an image in degrees. Raises Problem."""
+    """Parse the vertical field of view of an image, sent in degrees. Raises Problem."""
     return None if sent is None else _parse_number(sent, FIELD_OF_VIEW, MIN_FOV_DEG, MAX_FOV_DEG)
 
 

@@ -183,7 +183,7 @@ HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def image_parameters() -> list[dict[str, Any]]:
-    """OpenAPI parameters: the request headers of an image, and the same options in the query."""
+    """OpenAPI parameters of an image: its request headers, and the same options in the query."""
     common = {"in": "header", "required": False}
     found = [
         {"name": name, **common, "description": text, "schema": schema}
@@ -197,7 +197,7 @@ def image_parameters() -> list[dict[str, Any]]:
 
 
 def features_operation() -> dict[str, Any]:
-    """OpenAPI operation of POST /features, which does not use FastAPI."""
+    """OpenAPI operation of POST /features, which is not a route of FastAPI."""
     schema = {"$ref": "#/components/schemas/Features"}
     return {
         "summary": "Track features of one driver-view image",

@@ -1,4 +1,4 @@
-"""GET /stream: frames and answers over one WebSocket, with the rules of POST /features.
+"""GET /stream: a WebSocket that receives frames and sends answers, by the rules of POST /features.
 
 A binary message is one image. Its answer is a text message with JSON, or with the subprotocol
 `driverview.msgpack` a binary message with MessagePack. A new frame replaces a queued frame of the
@@ -164,7 +164,7 @@ class Stream:
 
 
 def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
-    """The options of a handshake. Raises Problem."""
+    """Parse the options of a WebSocket in its handshake. Raises Problem."""
     if scope["path"] != PATH:
         raise Problem(NOT_FOUND, f"there is no WebSocket at {scope['path']}; use {PATH}")
     headers = read_options(scope)
@@ -178,7 +178,7 @@ def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
 
 
 def _parse_metadata(text: str) -> Headers:
-    """The options in a text message, as headers. Raises Problem."""
+    """Parse the options of an image in a text message; return them as headers. Raises Problem."""
     if not text:
         return {}
     metadata = parse_json_object(text, "a text message") if len(text) <= MAX_TEXT else None

@@ -22,7 +22,7 @@ T = TypeVar("T")
 def _in_thread(
     method: Callable[Concatenate[Client, P], T],
 ) -> Callable[Concatenate["AsyncClient", P], Coroutine[Any, Any, T]]:
-    """Turns a method of `Client` into a method of `AsyncClient` with the same arguments."""
+    """Make a coroutine method of `AsyncClient` of a method of `Client`, with the same arguments."""
 
     @wraps(method)
     async def call(self: "AsyncClient", /, *arguments: P.args, **options: P.kwargs) -> T:

@@ -1,4 +1,4 @@
-"""Blocking client of the service: only the standard library, and one persistent connection.
+"""Blocking client of the service, with one persistent connection. It uses the standard library.
 
     with Client("http://127.0.0.1:8000") as client:
         client.wait_until_ready()
@@ -52,7 +52,8 @@ class ServiceError(UserError):
 
 
 def retry_pause_s(error: ServiceError) -> float | None:
-    """Time to wait before a retry in s; None if a retry is useless."""
+    """Time in s to wait before the request that failed with `error` is sent again; None if a retry
+    is useless."""
     if error.status is None:  # no reply: the service can be starting
         return RETRY_S
     if error.status not in (429, 503) or error.problem in NOT_RETRIED:
@@ -97,8 +98,8 @@ class Client:
         fov_y_deg: float | None = None,
         camera: str | None = None,
     ) -> dict[str, Any]:
-        """The track features of `image`, the bytes of a JPEG or PNG file, as POST /features returns
-        them. Raises ServiceError.
+        """Send `image`, the bytes of a JPEG or PNG file, to POST /features; return the answer with
+        its track features. Raises ServiceError.
 
         `content_type` is detected from the first bytes if it is None. `stream` names a stream of
         frames, in which a newer frame replaces a queued one. `fov_y_deg` is the vertical field of
@@ -124,7 +125,8 @@ class Client:
         return self._request_until(time.monotonic() + deadline_s, image, headers)
 
     def _request_until(self, end: float, image: bytes, headers: dict[str, str]) -> dict[str, Any]:
-        """Send the image, and retry while a retry can help, until `end` (s, monotonic clock)."""
+        """Send the image; after a failure, send it again while that can help, until `end` (s of the
+        monotonic clock)."""
         while True:
             left_s = max(0.0, end - time.monotonic())
             headers["X-Deadline-Ms"] = f"{min(1e3 * left_s, MAX_DEADLINE_MS):.1f}"
@@ -157,7 +159,8 @@ class Client:
         return True
 
     def wait_until_ready(self, timeout_s: float = 30.0) -> None:
-        """Wait until the service is ready. Raises ServiceError with the last reason."""
+        """Wait until the service is ready. Raises ServiceError, with the last reason, if it is not
+        ready after `timeout_s`."""
         end = time.monotonic() + timeout_s
         while True:
             try:
@@ -266,8 +269,8 @@ def _host(parts: SplitResult) -> str:
 
 
 def _check_headers(headers: dict[str, str]) -> None:
-    """Raise ServiceError for values that `http.client` refuses only after writing a part of the
-    request."""
+    """Raise ServiceError for values that a header cannot contain. `http.client` refuses them only
+    after it has sent a part of the request."""
     for name, value in headers.items():
         if UNSENDABLE_IN_HEADER.search(value):
             raise ServiceError(f"{name} has characters that a header cannot contain")

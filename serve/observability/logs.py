@@ -51,7 +51,8 @@ class JsonFormatter(logging.Formatter):
 
 
 class Interval:
-    """Passes each key at most once per INTERVAL_S, averaged over `workers` processes."""
+    """Lets each key pass at most once in INTERVAL_S times `workers`, so that `workers` processes
+    together let it pass at most once per INTERVAL_S on average."""
 
     def __init__(self, workers: int = 1) -> None:
         self._interval_s = INTERVAL_S * workers
@@ -68,7 +69,8 @@ class Interval:
 
 
 class ErrorLimit(logging.Filter):
-    """Passes equal warnings and errors once per INTERVAL_S; their arguments can differ."""
+    """Lets warnings and errors with the same logger and text template pass at most once per
+    INTERVAL_S."""
 
     def __init__(self, workers: int = 1) -> None:
         super().__init__()

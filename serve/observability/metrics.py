@@ -1,4 +1,4 @@
-"""Counters of frames and connections in shared memory, and their page for Prometheus.
+"""Counts frames and connections in shared memory, and writes the page of counts for Prometheus.
 
 Only the event loop of one worker writes a block, so an increment needs no lock. A replacement
 worker continues the counts in the block of its predecessor, so counters never decrease.
@@ -61,7 +61,8 @@ class Metrics:
         self._own[CLOSED_COUNTS + OUTCOME_INDEX[problem_type]] += 1.0
 
     def page(self, now: float, provenance: dict[str, str]) -> str:
-        """The metrics of all workers at `now`, in s of the monotonic clock."""
+        """The metrics of all workers as text for Prometheus. `now` is in s of the monotonic clock;
+        `provenance` identifies the served model."""
         return "\n".join([*self._lines(now, provenance), ""])
 
     def _lines(self, now: float, provenance: dict[str, str]) -> Iterator[str]:

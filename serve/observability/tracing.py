@@ -1,5 +1,5 @@
-"""OpenTelemetry spans: a request for features has a span, which contains the span of its frame,
-which contains the spans of the frame's stages.
+"""Records OpenTelemetry spans: the span of a request for features contains the span of its frame,
+and that contains the spans of the frame's stages.
 
 A request continues the trace of its `traceparent` header (W3C Trace Context); a frame of a
 WebSocket continues the trace of the handshake. Probes, pages, requests refused before they are read
@@ -20,7 +20,7 @@ from serve.scheduling.frame import FrameResult
 
 
 class RequestTracer:
-    """Records the spans of requests and frames. Where `span` is None, the current span is used."""
+    """Records the spans of requests and frames. A `span` of None stands for the current span."""
 
     def __init__(self, tracer: Tracer) -> None:
         self._tracer = tracer
@@ -70,7 +70,8 @@ class RequestTracer:
         frame.end()
 
     def record_problem(self, span: Span | None, problem: Problem, request_id: str) -> None:
-        """Record why a request was refused: in its span, or in a span `refuse` if it has none."""
+        """Record why a request was refused: in its span, or in a new span `refuse` if there is
+        none."""
         found = trace.get_current_span() if span is None else span
         if found.is_recording():
             _set_problem(found, problem, request_id)
@@ -79,8 +80,8 @@ class RequestTracer:
                 _set_problem(own, problem, request_id)
 
     def traced(self, app: App, paths: Collection[str]) -> App:
-        """`app` with a span for each POST to one of `paths`. The spans of a WebSocket's frames
-        continue the trace of its handshake."""
+        """Wrap `app` so that each POST to one of `paths` has a span. The spans of a WebSocket's
+        frames continue the trace of its handshake."""
 
         async def call(scope: Scope, receive: Receive, send: Send) -> None:
             if scope["type"] == "websocket":

@@ -1,1 +1,1 @@
-"""Scheduling: queues and the order of frames; limits on rate, memory and engine time of clients."""
+"""Queues frames and chooses their order; limits rate, memory and engine time of clients."""

@@ -13,6 +13,7 @@ from serve.config import network_of
 from serve.problems import OVERLOADED, Problem
 from serve.scheduling.fair_queue import FairQueue
 
+# The cost of an image is its estimated decoding time in ms.
 MAX_PENDING_MS = 1000.0  # cost of all unfinished large images of all clients
 MAX_CLIENT_MS = 250.0  # cost of a client's unfinished large images; one image is always allowed
 SHARE = 0.25  # share of the engine's time for a client's large images if other clients are present
@@ -26,14 +27,15 @@ class Admission:
     """Admits large images by their estimated decoding time. Use it in the event loop's thread."""
 
     def __init__(self, waiting: FairQueue) -> None:
-        """`waiting`: the queue, which reports whether other clients are present."""
+        """`waiting` is the frame queue; it knows whether other clients are present."""
         self._waiting = waiting
         self._pending_ms = 0.0
         self._client_ms: dict[Client, float] = {}  # cost of unfinished images
         self._credit: dict[Client, tuple[float, int]] = {}  # (remaining ms, at this time in ns)
 
     def admit(self, client: Client, cost_ms: float, now_ns: int) -> Callable[[], None]:
-        """Admit a large image. Returns a function to call when it is done. Raises Problem."""
+        """Admit a large image with the estimated decoding time `cost_ms`. Returns a function to
+        call when the image is done. Raises Problem if it is refused."""
         client = network_of(client)
         own = self._client_ms.get(client, 0.0)
         if own and own + cost_ms > MAX_CLIENT_MS:

@@ -28,12 +28,12 @@ class BodyBudget:
         self.held = 0
         self.end_slow_bodies: Callable[[float], float] = lambda _size: 0.0
         """Ends requests of this worker whose bodies arrive slowly, until the given number of bytes
-        is free or will soon be free; returns the number of bytes."""
+        is free or will soon be free; returns the number of freed bytes."""
 
     def take(self, size: int, small: bool) -> None:
-        """Reserve `size` more bytes. Raises Problem if that exceeds the budget.
+        """Reserve `size` more bytes. Raises Problem if they exceed the budget.
 
-        With `small`, slow bodies are ended to make room.
+        With `small`, requests whose bodies arrive slowly are ended to make room.
         """
         excess = self._excess(size)
         if excess > 0 and not (small and self.end_slow_bodies(excess) >= excess):
@@ -56,7 +56,8 @@ class BodyBudget:
 
 
 class BodyShare:
-    """The part of the budget of one request. Call `close` when it is answered or abandoned."""
+    """The bytes that one request has reserved in the budget. Call `close` when the request is
+    answered or abandoned."""
 
     __slots__ = ("_budget", "size")
 

@@ -1,4 +1,4 @@
-"""A lock in which clients take turns. A client is an IPv4 address or an IPv6 /64 network."""
+"""A lock that clients hold in turns. A client is an IPv4 address or an IPv6 /64 network."""
 
 import asyncio
 from collections import deque
@@ -18,7 +18,7 @@ class FairLock:
 
     @asynccontextmanager
     async def held(self, client: str) -> AsyncIterator[None]:
-        """Wait for the lock, and hold it within the context."""
+        """Wait for the lock as `client` (an address), and hold it within the context."""
         if self._locked:
             await self._wait(network_of(client))
         self._locked = True

@@ -26,7 +26,7 @@ class Slot:
 
 
 class FairQueue:
-    """The queue: one slot for each waiting frame, in the order of arrival. Not thread-safe."""
+    """A queue with one slot for each waiting frame, in the order of arrival. Not thread-safe."""
 
     def __init__(self) -> None:
         self._slots: list[Slot] = []
@@ -44,14 +44,14 @@ class FairQueue:
         return all(slot.frame.small for slot in self._slots)
 
     def note(self, client: str, now_ns: int) -> None:
-        """Record that a client has sent a frame, which may be refused."""
+        """Record that a client has sent a frame, also if the frame is then refused."""
         client = network_of(client)
         if client != self._newest[0]:
             self._other = self._newest
         self._newest = (client, now_ns)
 
     def others_present(self, client: str, now_ns: int) -> bool:
-        """Whether another client than `client` is present."""
+        """Whether a client other than `client` has sent a frame within the last PRESENT_NS."""
         same = self._newest[0] == network_of(client)
         latest_ns = (self._other if same else self._newest)[1]
         return now_ns - latest_ns < PRESENT_NS

@@ -1,4 +1,4 @@
-"""A frame, which is an image to process, and its result."""
+"""Dataclasses of a frame (an image to process) and of its result."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,13 @@ from trackfeatures.camera import CameraParameters
 PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
 """Returns the pixels (height, width, 3) uint8 RGB in the view of the model's camera."""
 ResultCallback = Callable[["FrameResult | Exception"], None]
+"""Called once with the result of a frame, or with the error that ended it."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """The prediction for a frame, its engine's provenance, and the time of each stage in ms."""
+    """The prediction for a frame, the members that identify model and engine, and the times in ms
+    of waiting, decoding and the forward pass."""
 
     prediction: Prediction
     provenance: dict[str, str]

@@ -174,7 +174,8 @@ class FrameQueue:
             self._streams.announce(frame.stream, frame.stamp_ns)
 
     def _enqueue_large(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
-        """Like `_enqueue`, for a frame that needs an admission until its result is known."""
+        """Admit a large image and queue its frame; the admission ends with the frame's result.
+        Returns and raises as `_enqueue` does."""
         done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
 
         def finish(result: FrameResult | Exception) -> None:
@@ -263,7 +264,7 @@ class FrameQueue:
                 self._loop.call_soon_threadsafe(slot.on_result, result)
 
     def _take_slot(self) -> Slot | None:
-        """The next slot for the thread; None if the queue is empty."""
+        """Take the slot that the thread processes next; None if the queue is empty."""
         with self._queue_lock:
             self._thread_busy = self._dispatched = self._waiting.count > 0
             return self._waiting.take() if self._dispatched else None

@@ -1,4 +1,4 @@
-"""An engine as the frame queue holds it: in use, or loaded to replace the engine in use."""
+"""Dataclasses of the frame queue's engines: the engine in use, and one that is to replace it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class LoadedEngine:
 
     @classmethod
     def of(cls, engine: Engine) -> "LoadedEngine":
-        """`engine` with its provenance."""
+        """Combine `engine` with the members that identify it."""
         provenance = {
             "model": engine.card.model_hash,
             "definitions_version": tf.VERSION,

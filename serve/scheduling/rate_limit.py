@@ -1,4 +1,4 @@
-"""Rate limit for each client address: a token bucket, shared by all workers.
+"""Limits the request rate of each client address by a token bucket that all workers share.
 
 The buckets are in shared memory without a lock. Two workers can count two simultaneous requests as
 one, so a client can get slightly more than its rate, but never less.
@@ -16,10 +16,11 @@ from serve.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 
 @lru_cache(4096)
 def client_key(address: str, public: bool = False) -> float:
-    """The key of a client address: an integer above 0, exact as a float; 0.0 for this machine.
+    """The key of a client address in the table of buckets: an integer above 0 that a float holds
+    exactly; 0.0 for this machine.
 
-    All addresses of an IPv6 /64 network are one client. `public`: the key for paths that need no
-    token.
+    All addresses of an IPv6 /64 network have the same key. `public` gives another key, for the
+    bucket of paths that need no token.
     """
     if not address or is_loopback(address):
         return 0.0
@@ -29,7 +30,8 @@ def client_key(address: str, public: bool = False) -> float:
 
 
 class RateLimiter:
-    """The buckets of all clients: (key, remaining tokens, time of the last update in s)."""
+    """Limits the request rate of all clients. `cells` holds each client's bucket: (key, remaining
+    tokens, time of the last update in s)."""
 
     def __init__(self, cells: "memoryview[float]", per_second: float) -> None:
         self._cells = cells

@@ -1,4 +1,4 @@
-"""The newest frame of each stream, in a table shared by all workers.
+"""Records the newest frame of each stream in a table that all workers share.
 
 A frame's stamp is the time at which its request began, in ns of the machine's monotonic clock,
 which all processes share. Queued frames are announced with their stamp; a frame is superseded if a
@@ -21,13 +21,13 @@ def stream_key(client: str, name: str) -> int:
 
 
 class StreamTable:
-    """The newest stamp of each stream: (key, stamp) in open addressing."""
+    """The newest stamp of each stream: `cells` is a hash table of pairs (key, stamp in ns)."""
 
     def __init__(self, cells: "memoryview[int]") -> None:
         self._cells = cells
 
     def announce(self, key: int, stamp_ns: int) -> None:
-        """Record a queued frame, unless the table has no free entry for its stream."""
+        """Record the stamp of a queued frame, unless the table has no free entry for its stream."""
         cells = self._cells
         free = -1
         for at in _indices(key):

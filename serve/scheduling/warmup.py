@@ -1,7 +1,7 @@
 """Checks a loaded model before it answers any client.
 
-The engine is run on the golden image, a synthetic road (`mtlnet.inference.golden_image`). The model
-card contains the outputs of torch in float32 for this image, computed when the model was published.
+The engine processes a synthetic image of a road (`mtlnet.inference.golden_image`). The model card
+contains the outputs of torch in float32 for this image, computed when the model was published.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""HTTP connections with deadlines, and limits for their number and for the size of headers.
+"""HTTP connections with deadlines and with limits for their number and for the size of headers.
 
 This is uvicorn's httptools protocol, extended by a deadline for each phase of a connection.
 `WorkerServer` checks the deadlines ten times per second, so a deadline costs a request only a few
@@ -83,8 +83,8 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_after_reply()
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close the connection if it has been idle for DRAIN_S. Returns whether all replies to its
-        client have been sent."""
+        """Close the connection if it has been idle for DRAIN_S, `elapsed_s` after draining began.
+        Returns whether all replies to its client have been sent."""
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
         # Answers sent before draining began had no "Connection: close", so the client can send
         # one more request.
@@ -110,7 +110,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.cycle.transport = LingeringTransport(self)  # type: ignore[assignment]
 
     def end(self) -> None:
-        """Close after the last reply; with a lingering close if the client can still be sending."""
+        """Close after the last reply; if the client can still be sending, once it has closed."""
         lingers = self.guard.draining or self._phase is Phase.BODY
         (self.linger if lingers else self.transport.close)()
 

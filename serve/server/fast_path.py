@@ -1,6 +1,6 @@
-"""Handles POST /features without ASGI (no scope, no task, no messages), from parser to reply.
+"""Handles POST /features from parser to reply without ASGI (no scope, no task, no messages).
 
-ASGI would cost more than all other work of a request besides the model. ASGI handles all other
+ASGI would cost more than all other work of a request besides the model. It handles all other
 requests, and POST /features with an upgrade, with "Expect: 100-continue", with X-Forwarded-For, or
 pipelined before the reply to the previous request.
 """
@@ -25,14 +25,14 @@ ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
 class NullEvent:
-    """An event without waiting tasks."""
+    """Stands for uvicorn's event of a request; no task waits for it."""
 
     def set(self) -> None:
         """Do nothing."""
 
 
 class DirectRequest:
-    """A request in progress. It has the attributes that uvicorn reads from a
+    """A request POST /features in progress. It has the attributes that uvicorn reads from its
     RequestResponseCycle."""
 
     __slots__ = (
@@ -70,7 +70,7 @@ class DirectRequest:
             self.parts.append(bytearray(part))
 
     def drop(self) -> None:
-        """Drop the body, and `features`: the two objects reference each other."""
+        """Drop the body and `features`; this object and `features` reference each other."""
         if self.features is not None:
             self.features.abandon()
         self.features = None
@@ -84,7 +84,7 @@ class DirectRequest:
 
 
 class DirectProtocol(GuardedProtocol):
-    """One HTTP connection to `service`."""
+    """One HTTP connection to `service`; it handles POST /features itself."""
 
     def __init__(self, *arguments: Any, service: Service, **named: Any) -> None:
         super().__init__(*arguments, **named)

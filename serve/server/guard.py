@@ -1,10 +1,10 @@
 """State shared by the connections of one worker: limits, a clock, the choice of connections to end.
 
-Each connection is in one group, according to what it waits for; a group is ordered by the time of
-waiting, longest first. If the number of connections is at its limit, a new connection ends an old
-one, in this order: refused connections that linger, requests that arrive slowly, connections idle
-for longest (first the connections without any answered image), WebSockets without messages. A new
-connection never ends a connection of a client that has fewer connections than its own client.
+Each connection is in one group, according to what it waits for. In a group, the connection that has
+waited longest is first. If the number of connections is at its limit, a new connection ends an old
+one, in this order: refused connections that still read, requests that arrive slowly, idle
+connections (first those without an answered image), WebSockets without messages. A new connection
+never ends a connection of a client that has fewer connections than the new connection's client.
 """
 
 import time
@@ -48,13 +48,13 @@ class Guarded(Protocol):
 
 
 class Drained(Guarded, Protocol):
-    """The interface of a connection for its worker, which can stop."""
+    """The interface of a connection for a worker that stops (drains its connections)."""
 
     lingers: bool
     """Whether the last bytes were sent and the client has not closed the connection yet."""
 
     def begin_draining(self) -> None:
-        """Announce in the next reply that it is the last reply."""
+        """Make the next reply the last one of the connection, and announce this in it."""
 
     def drain(self, elapsed_s: float) -> bool:
         """Close the connection if all replies to its client have been sent, `elapsed_s` after
@@ -79,7 +79,7 @@ class ConnectionGuard:
     other_connections: Callable[[], int] = lambda: 0
     """Returns the number of connections of the other workers."""
     ask_for_room: Callable[[int], None] = lambda _least: None
-    """Asks another worker to end a connection; its argument is `least` of `make_room`."""
+    """Asks another worker to end a connection of a client with at least this many connections."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
     bodies: BodyBudget | None = None
     """The budget for incomplete WebSocket messages; None: no budget."""
@@ -114,8 +114,8 @@ class ConnectionGuard:
             self.open[connection.network] += 1
 
     def place(self, connection: Guarded, group: Group) -> float:
-        """Move a connection to the end of a group, from which its waiting time counts; returns the
-        clock's time in s."""
+        """Move a connection to the end of a group and restart its waiting time; return the clock's
+        time in s."""
         connection.group.pop(connection, None)
         connection.group = group
         group[connection] = None
@@ -142,8 +142,8 @@ class ConnectionGuard:
         return made
 
     def make_room(self, excess: int, least: int) -> bool:
-        """End `excess` connections in the order of the module's docstring; False if fewer could be
-        ended.
+        """End `excess` connections: refused, slow, idle, then WebSockets, the oldest first. Returns
+        False if fewer could be ended.
 
         `least` is the number of connections of the newcomer's client. Clients with fewer
         connections lose none. If all candidates are too young, young connections of clients with
@@ -199,8 +199,8 @@ class ConnectionGuard:
     def pause_reading(self, connection: HttpToolsProtocol) -> None:
         """Pause reading from a refused client for REFUSAL_PAUSE_S.
 
-        Then the next requests of all clients refused in this time are handled together. Waking the
-        loop for each request would take processor time from the engine.
+        So the event loop handles the next requests of all clients refused in this time together.
+        Waking it for each request would take processor time from the engine.
         """
         if not self.paused:
             connection.loop.call_later(REFUSAL_PAUSE_S, self._resume_reading)

@@ -1,6 +1,6 @@
 """Returns free memory of the C library's heap to the operating system.
 
-Otherwise the process keeps the memory that hundreds of connections or a few large images needed.
+Without it the process keeps the memory that hundreds of connections or a few large images needed.
 """
 
 import ctypes
@@ -12,7 +12,8 @@ GROWTH_BYTES = 8 << 20  # growth of resident memory above its minimum that trigg
 
 
 class HeapTrimmer:
-    """Trims the heap if resident memory has grown by GROWTH_BYTES above its minimum."""
+    """Returns free heap memory to the system if resident memory has grown by GROWTH_BYTES above its
+    minimum."""
 
     def __init__(self) -> None:
         self._least_bytes = _resident_bytes()

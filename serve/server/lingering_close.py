@@ -1,4 +1,4 @@
-"""Lingering close: the server sends its last reply, then reads until the client closes.
+"""Lingering close: after its last reply the server reads until the client closes the connection.
 
 Closing a connection with unread bytes resets it, and the client loses the reply (RFC 9112, 9.6).
 """
@@ -13,17 +13,18 @@ class LingeringConnection(Protocol):
     transport: asyncio.Transport
 
     def end(self) -> None:
-        """Close after the last reply; with a lingering close if the client can still be sending."""
+        """Close after the last reply; if the client can still be sending, once it has closed."""
 
 
 class LingeringTransport:
-    """The transport for a connection's last reply: its `close` calls the connection's `end`."""
+    """Replaces the transport of a connection for its last reply: `close` calls the connection's
+    `end`, which reads on before it closes."""
 
     def __init__(self, connection: LingeringConnection) -> None:
         self._connection = connection
 
     def write(self, data: bytes) -> None:
-        """Send bytes."""
+        """Send `data` to the client."""
         self._connection.transport.write(data)
 
     def is_closing(self) -> bool:
@@ -31,5 +32,5 @@ class LingeringTransport:
         return self._connection.transport.is_closing()
 
     def close(self) -> None:
-        """End the connection after what was written."""
+        """End the connection after the written bytes."""
         self._connection.end()

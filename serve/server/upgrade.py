@@ -1,5 +1,5 @@
-"""Requests with an upgrade: a handshake becomes a WebSocket; any other upgrade is ignored, as RFC
-9110 (7.8) allows."""
+"""Handles requests with an upgrade: opens a WebSocket for its handshake and ignores any other
+upgrade, as RFC 9110 (7.8) allows."""
 
 from typing import TYPE_CHECKING
 
@@ -27,8 +27,8 @@ def parse_upgrades(connection: "GuardedProtocol", rest: bytes) -> None:
 
 
 def _upgrade(connection: "GuardedProtocol", rest: bytes) -> bytes:
-    """Hand over to a WebSocket, or refuse, and return b"". For another upgrade, return the request
-    without the upgrade headers, followed by `rest`, to be parsed again."""
+    """Open a WebSocket for a handshake or refuse it, and return b"". For another upgrade, return
+    the request without the upgrade headers, followed by `rest`, to be parsed again."""
     connection.upgrading = False
     if connection.parser.get_method() == b"CONNECT":
         connection.send_400_response("")

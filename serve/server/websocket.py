@@ -87,7 +87,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         return self._discarding or self.transport.is_closing()
 
     def end_draining(self) -> None:
-        """Close the connection with a reason."""
+        """Close the connection with the reason that the service stops."""
         if not (self._discarding or self.transport.is_closing()):
             self.fail(CloseCode.SERVICE_RESTART, "the service stops or restarts; connect again")
 
@@ -154,7 +154,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             super().handle_cont(event)
 
     def _refuse_long_text(self, kind: str) -> bool:
-        """Close if the message is a text above MAX_TEXT_BYTES, before it is decoded."""
+        """Close the connection if the current message is a text above MAX_TEXT_BYTES, before it is
+        decoded. Returns whether it was closed."""
         if kind != "text" or self._frame_bytes <= MAX_TEXT_BYTES:
             return False
         self._guard.count_closed(INVALID_REQUEST)
@@ -188,7 +189,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         super().handle_events()
 
     def _allow(self, small: int) -> bool:
-        """Count `small` small frames; False if they exceed the rate."""
+        """Count `small` small frames; return False if they exceed the allowed rate."""
         self._small_frames -= small
         if self._small_frames < 0:
             now = self._guard.clock()

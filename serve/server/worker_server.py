@@ -187,7 +187,8 @@ class WorkerServer(uvicorn.Server):
         task.add_done_callback(self.server_state.tasks.discard)
 
     def _may_accept(self) -> bool:
-        """Count a new connection; False if too many are arriving."""
+        """Count a new connection; return False if connections arrive at more than the allowed
+        rate."""
         now = self._loop.time()
         earned = (now - self._accepts_counted_s) * ACCEPTS_PER_S
         self._accepts = min(self._accepts + earned, ACCEPTS_AT_ONCE)

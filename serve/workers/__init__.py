@@ -1,1 +1,1 @@
-"""Worker processes: start, end and replacement by the supervisor; their shared memory."""
+"""The supervisor and its worker processes: start, stop, replacement, new weights, commands."""

@@ -1,4 +1,4 @@
-"""Commands to a running service (`reload`, `restart`) over a Unix socket, never over HTTP.
+"""Sends commands (`reload`, `restart`) to a running service over a Unix socket, not over HTTP.
 
 The socket is in a folder that only its owner can enter; its name contains the service's port.
 Command and answer are one line of JSON each: {"command", "model"}, then {"ok", "text"}.
@@ -59,7 +59,8 @@ def send_command(port: int, command: str, model: str | None = None) -> str:
 
 
 async def listen_for_commands(port: int, commands: dict[str, Command]) -> asyncio.Server | None:
-    """Accept commands for the service on `port`; None if no socket can be created."""
+    """Accept commands for the service on `port`: each function in `commands` gets a model's name or
+    None and returns the answer. Returns None if no socket can be created."""
     path = socket_path(port)
 
     async def handle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -108,6 +109,6 @@ def _accepts(path: Path) -> bool:
 
 
 def _check_owner(folder: Path) -> None:
-    """Raise PermissionError if another user owns the folder: its name can be guessed."""
+    """Raise PermissionError if another user owns the folder; anyone can create its known name."""
     if folder.stat().st_uid != os.getuid():
         raise PermissionError(f"{folder} belongs to another user")

@@ -1,4 +1,4 @@
-"""The parent process of the workers: starts them, replaces dead ones, distributes new weights.
+"""The parent process of the workers: it starts them, replaces dead workers, distributes weights.
 
 It answers no requests and loads no engine. SIGTERM and SIGINT stop the service, SIGHUP reloads the
 model, SIGUSR2 replaces the workers one by one. `serve reload` and `serve restart` request a reload
@@ -49,7 +49,7 @@ class ServicePlan:
 
 
 class Supervisor:
-    """The workers of one service."""
+    """Starts, replaces, reloads and stops the workers of one service."""
 
     def __init__(self, plan: ServicePlan, listeners: Sequence[socket.socket]) -> None:
         self._plan = plan
@@ -257,7 +257,7 @@ def _has_terminal() -> bool:
 
 
 async def _log_errors(action: Callable[[], Any]) -> None:
-    """Run the action that a signal requests; errors are only logged."""
+    """Run the `action` that a signal requests; UserError and OSError are only logged."""
     try:
         await action()
     except (UserError, OSError) as error:

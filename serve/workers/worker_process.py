@@ -1,4 +1,4 @@
-"""A worker process as the supervisor handles it: start, messages, end.
+"""Starts a worker process, exchanges messages with it and stops it, for the supervisor.
 
 `serve.worker` describes the messages between the two processes.
 """
@@ -45,7 +45,7 @@ class WorkerTask:
 
     @classmethod
     def from_json_line(cls, line: str) -> "WorkerTask":
-        """The task from a line of JSON."""
+        """Read the task from a line of JSON."""
         content = json.loads(line)
         cameras = {name: CameraParameters(**each) for name, each in content["cameras"].items()}
         limits = Limits(**content["limits"])
@@ -124,7 +124,7 @@ class WorkerProcess:
         await self._process.wait()
 
     async def stop(self, timeout_s: float) -> None:
-        """Send SIGTERM, then SIGKILL if the process has not ended in time."""
+        """Send SIGTERM, and SIGKILL if the process has not ended after `timeout_s`."""
         if self._process.returncode is None:
             self._process.terminate()
             try:
