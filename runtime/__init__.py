@@ -1,1 +1,1 @@
-"""What every package uses: commands, sockets, files, compiled functions, HTML pages and charts."""
+"""Code that all packages use: commands, sockets, files, compilation, films, HTML pages, charts."""

@@ -18,8 +18,8 @@ MIN_TOKEN_LENGTH = 16
 
 
 def read_token(path: Path | None) -> str | None:
-    """The token in the file `path`; without `path`, in $DRIVERVIEW_TOKEN; else None.
-    Raises UserError if the file is missing or the token is unsuitable."""
+    """Read the token from the file `path`, or without `path` from $DRIVERVIEW_TOKEN; None if that
+    is empty. Raises UserError if the file is missing or the token is unsuitable."""
     if path is None:
         token = os.environ.get(TOKEN_VARIABLE, "").strip()
         source = f"${TOKEN_VARIABLE}"
@@ -41,7 +41,8 @@ def read_token(path: Path | None) -> str | None:
 
 
 def check_exposure(host: str, token: str | None, insecure: bool) -> None:
-    """Raise UserError if other machines could use the service without a token."""
+    """Raise UserError if other machines can reach `host` and there is no token, unless `insecure`
+    allows it."""
     if is_loopback(host) or token is not None or insecure:
         return
     raise UserError(
@@ -82,8 +83,8 @@ class HostNames:
         return is_loopback(name) or name in self._names or (self._any_address and _is_ip(name))
 
     def allow_origin(self, origin: bytes, host: bytes) -> bool:
-        """Whether a request with this Origin is accepted: the service's own origin, or a known name
-        behind a proxy.
+        """Whether a request with this Origin is accepted: the service's own origin (equal to Host),
+        or an accepted name, since a proxy can change Host.
 
         Other origins are refused: a page of another site could send requests through the browser of
         a user who can reach this service.
@@ -98,7 +99,7 @@ class HostNames:
 
 
 def host_name(host: bytes) -> str | None:
-    """The name in `name:port`, in lower case; None if malformed.
+    """The name in a Host header (`name` or `name:port`), in lower case; None if it is malformed.
 
     An IPv6 address is returned in its shortest form, without brackets and without its zone, because
     a zone has a meaning on one machine only.

@@ -1,7 +1,7 @@
 """Reads camera files in YAML (our format, OpenCV, ROS, Kalibr) as `CameraParameters`; writes ours.
 
 Our format has the fields of `CameraParameters`, with `height_above_road_m` in place of `z`. The
-other formats describe image size and lens; the mount's keys of our format can be added to them.
+other formats describe image size and lens; the keys of our format for the mount can be added.
 """
 
 import re
@@ -26,7 +26,7 @@ NOT_ASSUMED: dict[str, Any] = {
     "coefficients": (),
     "height_std": 0.0,
 }
-"""Values of fields that a file omits; other omitted fields come from the default camera."""
+"""Values of these fields if a file omits them. Others then have the default camera's values."""
 LIMITS_DEG = {"pitch_deg": 30.0, "roll_deg": 30.0, "yaw_deg": 180.0}
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "k", "mtx")
 COEFFICIENT_KEYS = (
@@ -44,10 +44,11 @@ MODELS = {
     "fisheye": "fisheye",
     "kannala_brandt": "fisheye",
 }
-"""Names of distortion models in files, with our names."""
+"""Names of distortion models in files, each with its name in `CameraParameters`."""
 MAX_SKEW = 1e-3  # as a fraction of the focal length
 
 Note = Callable[[str], None]
+"""Called with a line of text for the user."""
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
@@ -66,11 +67,11 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix_of_opencv)
 def read_camera(
     path: Path, default: CameraParameters, note: Note | None = None
 ) -> CameraParameters:
-    """The camera that a file describes: our format, OpenCV, ROS `camera_info` or Kalibr's camchain.
+    """Read the camera in a file of our format, OpenCV, ROS `camera_info` or Kalibr's camchain.
 
-    Size, mount and field of view are taken from `default` if the file omits them; the lens is not.
-    `note` is called with a line about chosen or assumed values. Raises UserError with a one-line
-    message for a faulty file.
+    Size, mount and field of view come from `default` if the file omits them; the default lens is a
+    pinhole. `note` is called with a line about chosen or assumed values. Raises UserError with a
+    one-line message for a faulty file.
     """
     content = _load(path)
     try:
@@ -115,7 +116,8 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _values(content: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The kind of file (empty for our format), and the camera's fields that the file gives."""
+    """The kind of a file with this content ("" for our format), and the fields of the camera that
+    it gives."""
     if cameras := sorted(str(key) for key in content if re.fullmatch(r"cam\d+", str(key))):
         others = f" of {', '.join(cameras)}" if len(cameras) > 1 else ""
         return f"{cameras[0]}{others} of a Kalibr camchain", _kalibr(content, cameras[0])
@@ -140,7 +142,7 @@ def _ours(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _opencv(content: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a calibration file of OpenCV or a `camera_info` of ROS."""
+    """Read the camera's fields from a calibration file of OpenCV or a `camera_info` of ROS."""
     key = next(key for key in MATRIX_KEYS if key in content)
     k = _numbers(key, content[key])
     if len(k) != 9:
@@ -195,7 +197,8 @@ def _kalibr(content: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def read_distortion(model: Any, given: list[float]) -> dict[str, Any]:
-    """The fields of `CameraParameters` for a lens model by any of its names. Raises CameraError."""
+    """The fields `distortion` and `coefficients` of `CameraParameters` for a lens model (any key of
+    `MODELS`) with the coefficients `given`; none for a pinhole. Raises CameraError."""
     if not isinstance(model, str) or model.lower() not in MODELS:
         known = ", ".join(MODELS)
         raise CameraError(f"the distortion model is {model!r}; known models are {known}")
@@ -208,7 +211,7 @@ def read_distortion(model: Any, given: list[float]) -> dict[str, Any]:
 
 
 def _plain(content: dict[str, Any], keys: Any) -> dict[str, Any]:
-    """The numbers that the file has under `keys`, by field of `CameraParameters`."""
+    """Read the numbers that the file has under `keys`, by field of `CameraParameters`."""
     if HEIGHT in content and "z" in content:
         raise CameraError(f"the file has both z and {HEIGHT}; leave one out")
     values: dict[str, Any] = {}
@@ -241,7 +244,8 @@ def _number(name: str, value: Any) -> float:
 
 
 def _numbers(name: str, value: Any) -> list[float]:
-    """The finite numbers in a list, a list of rows, or a matrix of OpenCV or ROS."""
+    """The numbers in a list, a list of rows, or a matrix of OpenCV or ROS, as one flat list. Raises
+    CameraError for anything else; `name` is the key, for the message."""
     if isinstance(value, dict):
         data = value.get("data")
         if data is None:

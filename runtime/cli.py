@@ -1,4 +1,4 @@
-"""What all commands share: exit codes, the error line, the option `--json`.
+"""Code that all commands share: exit codes, the error line, progress bars, the option `--json`.
 
 Results go to stdout; errors, progress and logs go to stderr. Any file name can be printed on any
 terminal: characters that the terminal cannot show become escapes, e.g. `caf\\udce9.jpg`.
@@ -68,8 +68,8 @@ def progress_bar() -> "Progress":
 
 @contextmanager
 def progress(text: str = "") -> Iterator[Callable[..., None]]:
-    """Show a progress bar with `text`; yields a function of the numbers done and in total and, if
-    it changes, the text."""
+    """Show a progress bar with `text`. Yields a function that updates it; its arguments are the
+    number done, the total number and, if it changes, the text."""
     from rich.markup import escape
 
     with progress_bar() as bar:
@@ -82,7 +82,7 @@ def progress(text: str = "") -> Iterator[Callable[..., None]]:
 
 
 def printable(text: str) -> str:
-    """`text` with control characters as escapes, so on one line. File names can contain them."""
+    """`text` in one line: control characters, which file names can contain, become escapes."""
     return text if text.isprintable() else "".join(map(_printable, text))
 
 

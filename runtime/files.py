@@ -1,4 +1,4 @@
-"""Atomic writes (the old file stays until the new one is complete), locks, and sorting of names.
+"""Writes files atomically (the old file stays until the new one is complete); locks; file names.
 
 A file name can contain any bytes. `os.fsdecode` turns bytes that are not UTF-8 into surrogates, and
 text files get surrogates as escapes: the Latin-1 name `caf\\xe9.jpg` becomes `caf\\udce9.jpg`.
@@ -21,7 +21,8 @@ STAGED = ".staged"  # the folder of `replaced_files` for new files
 
 
 def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
-    """Sort key for names with numbers: `frame2` before `frame10`, `b1` after `A1`.
+    """Sort key of a name that orders numbers by value and ignores case: `frame2` before `frame10`,
+    `A1` before `b1`.
 
     A run of ASCII digits is a number; other digits, signs and decimal points are text.
     """
@@ -55,7 +56,7 @@ def utf8_path(path: Path) -> Iterator[Path]:
 
 
 def name_as_text(name: str) -> str:
-    """Name of a file as text, with bytes that are not UTF-8 as escapes."""
+    """The name of a file as text that can be encoded: bytes that are not UTF-8 become escapes."""
     return name.encode(errors="backslashreplace").decode()
 
 
@@ -103,7 +104,8 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
 
 
 def write_json(path: Path, content: object) -> None:
-    """Replace the file at `path` by `content` as indented JSON, as `atomic_write` with `fsync`."""
+    """Replace the file at `path` atomically by `content` as indented JSON, and wait until it is on
+    the disk. Raises the errors of `atomic_write`."""
     atomic_write(path, json.dumps(content, indent=1) + "\n", fsync=True)
 
 
@@ -160,7 +162,7 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Lock the folder within the context; a lock ends with its process.
+    """Lock the folder within the context. The lock also ends if the process ends.
 
     Raises UserError if another process holds the lock.
     """

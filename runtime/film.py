@@ -1,4 +1,4 @@
-"""Writes images to a film: an MPEG-4 file (.mp4)."""
+"""Writes images to a video file (MPEG-4, .mp4), and reads the boxes of MP4 files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +16,10 @@ BOX_HEAD = 8
 
 
 class Mp4Writer:
-    """A film of `fps` images per second; it can be played even if the command is interrupted.
+    """Writes a film of `fps` images per second, which can be played even after an interruption.
 
-    The first image sets the film's size. Use it as a context manager, which closes the file. Raises
-    UserError if the file cannot be written, at the latest on closing.
+    The first image sets the film's size. Use the writer as a context manager, which closes the
+    file. Raises UserError if the file cannot be written, at the latest when it is closed.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -59,9 +59,10 @@ def _is_complete(path: Path) -> bool:
 
 
 def boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """(type, start, end of the content) of each box of an MP4 file from byte `start` to `end`.
+    """Yield (type, start of the content, end) of each box of an MP4 file from byte `start` to
+    `end`.
 
-    The last box can end beyond `end`; bytes that are not a box end the list. Source: ISO 14496-12.
+    The last box can end beyond `end`; bytes that are no box end the list. Source: ISO 14496-12.
     """
     while start + BOX_HEAD <= end:
         file.seek(start)

@@ -1,7 +1,7 @@
-"""Renders HTML pages from jinja2 templates with autoescape; images are embedded.
+"""Renders self-contained HTML pages from jinja2 templates; text is escaped, images are embedded.
 
-A page is one self-contained file. Its template extends `page_shell.html` (style sheet, title) and
-can import the table macro of `macros.html`.
+The template of a page extends `page_shell.html` (style sheet, title) and can import the table macro
+of `macros.html`.
 """
 
 import base64
@@ -16,7 +16,7 @@ JPEG_QUALITY = 80
 
 
 def render(package: str, template: str, **values: Any) -> str:
-    """The HTML of `template`, a file of `package`; text in `values` is escaped.
+    """Render `template`, a file of `package`, to HTML. Text in `values` is escaped.
 
     Values that already are HTML (charts) must be `markupsafe.Markup`. Raises jinja2.UndefinedError
     if the template uses a value that is not given.

@@ -26,13 +26,13 @@ from numba.extending import intrinsic, register_jitable
 
 OWN_MODE = 0o700
 CONTAINED = {"controllers": ("simulator",)}
-"""Packages whose functions and constants a package's compiled code contains, beside those of
-trackfeatures."""
+"""Maps a package to the packages whose functions and constants its compiled code contains. Compiled
+code can always contain those of `trackfeatures`."""
 UNUSED_DAYS = 30.0  # after this time, unused machine code of other source versions is deleted
 
 
 def code_folder(name: str, *packages: Path) -> Path:
-    """A writable folder for the machine code of the sources in `packages`.
+    """Create or find a writable folder for the machine code of the sources in `packages`.
 
     The folder is named after `name` and a hash of the sources. It is in `$NUMBA_CACHE_DIR`, or in
     the user's cache folder; if neither is writable, it is a temporary folder that is deleted when
@@ -63,8 +63,8 @@ def code_folder(name: str, *packages: Path) -> Path:
 
 
 def _make_own(folder: Path) -> bool:
-    """Create `folder`, or take an existing one, writable for this user only.
-    Returns False if it is a link, belongs to another user or is not writable."""
+    """Create `folder`, or make an existing one accessible only for this user. Returns False if it
+    is a link, belongs to another user or is not writable."""
     with suppress(FileExistsError):
         folder.mkdir(mode=OWN_MODE)
     found = folder.lstat()
@@ -110,7 +110,8 @@ def compiled(function: Function) -> Function:
 
 
 def compiled_for_threads(function: Function) -> Function:
-    """Like `compiled`, but the function releases the GIL: threads can run it in parallel."""
+    """Compile `function` with numba in no-python mode so that it releases the GIL: threads can run
+    it in parallel."""
     return _compiled(function, nogil=True)
 
 
@@ -120,7 +121,7 @@ def callable_from_compiled(function: Function) -> Function:
 
 
 class Borrow(Protocol):
-    """The type of `borrowed`."""
+    """The type of `borrowed`: a function that returns its argument."""
 
     def __call__(self, array: Item) -> Item: ...
 
@@ -136,14 +137,14 @@ def _borrow(typing_context: Any, array: Any) -> Any:
 
 
 borrowed: Borrow = cast(Any, intrinsic(_borrow))
-"""In compiled code: the same array without reference counting. Otherwise each view of the array
-changes the reference count by atomic operations, which take longer than the arithmetic of a small
-function. Use it on arguments only: the caller holds them until the function returns."""
+"""Returns, in compiled code, the same array without reference counting. With counting, each view of
+the array causes atomic operations, which take longer than the arithmetic of a small function. Use
+`borrowed` on arguments only: the caller holds them until the function returns."""
 
 
 def inlined(function: Function) -> Function:
-    """Like `compiled`, for a small function of a hot loop: its machine code is copied into the code
-    of each caller, so that no arrays are passed."""
+    """Compile a small function of a hot loop with numba. Its machine code is copied into the code
+    of each compiled caller, so that no arrays are passed."""
     return _compiled(function, nogil=False, forceinline=True)
 
 

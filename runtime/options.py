@@ -1,6 +1,6 @@
-"""Makes the fields of a configuration's dataclass options of a command: each is declared once.
+"""Makes command-line options of the fields of a dataclass, so that each option is declared once.
 
-A field that is an option has it in its type: `size: Annotated[int, typer.Option(help="...")] = 32`.
+The type of such a field contains the option: `size: Annotated[int, Option(help="...")] = 32`.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ Command = Callable[..., None]
 def options_of(
     config: Any, *, make: Callable[..., Any] | None = None, only_given: bool = False
 ) -> Callable[[Command], Command]:
-    """Add the options of the dataclass `config` to a command, which takes a `config` first.
+    """Decorator that adds the options of the dataclass `config` to a command.
 
-    `make` makes that first argument of the options' values; a command that computes other fields
-    itself takes a `dict`. With `only_given` the dictionary has only the options that the user gave.
-    The command finds the other values elsewhere; the help shows the dataclass's defaults.
+    The first argument of the command is an instance of `config`, or the result of `make` called
+    with the options' values (`dict` if the command computes other fields itself). With `only_given`
+    it is a dictionary of the options that the user gave; the help shows the dataclass's defaults.
     """
     types = get_type_hints(config, include_extras=True)
     added = [
@@ -50,7 +50,8 @@ def options_of(
 
 
 def _parameter(field: Field[Any], type_: Any, only_given: bool) -> Parameter:
-    """The field as a parameter of a command; an option with a parser has the type of text."""
+    """The field as a parameter of a Typer command. An option with a parser has the type `str`; with
+    `only_given` the default is None (False for a flag)."""
     kind, option = get_args(type_)
     default = Parameter.empty if field.default is MISSING else field.default
     if getattr(option, "parser", None) is not None:

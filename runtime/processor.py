@@ -1,7 +1,6 @@
-"""Finds the number formats that this processor multiplies natively; it is slow in other formats.
+"""Finds out whether this processor multiplies bf16 and int8 natively; otherwise they are slow.
 
-They are read from the flags in /proc/cpuinfo. On systems other than Linux no format counts as
-native.
+The flags in /proc/cpuinfo show it. On systems other than Linux no format counts as native.
 """
 
 from functools import cache
@@ -10,8 +9,8 @@ from pathlib import Path
 CPUINFO = Path("/proc/cpuinfo")
 BF16_FLAGS = {"avx512_bf16", "amx_bf16", "bf16"}
 INT8_FLAGS = {"avx512_vnni", "avx_vnni", "avx_vnni_int8", "amx_int8", "i8mm", "asimddp"}
-"""Instructions that sum products of 8-bit numbers in 32 bits. x86: without them, sums of two
-products saturate at 16 bits. ARM: `i8mm` and `asimddp` (dot products)."""
+"""Flags of instructions that sum products of 8-bit numbers in 32 bits. Without them, an x86
+processor saturates sums of two products at 16 bits. ARM: `i8mm` and `asimddp` (dot products)."""
 
 
 def has_bf16() -> bool:
@@ -26,7 +25,8 @@ def has_int8() -> bool:
 
 @cache
 def flags(cpuinfo: Path) -> frozenset[str]:
-    """Flags (x86) or features (ARM) of the first processor; none where there is no such file."""
+    """Flags (x86) or features (ARM) of the first processor in the file `cpuinfo`; empty if there is
+    no such file."""
     if not cpuinfo.is_file():
         return frozenset()
     for line in cpuinfo.read_text().splitlines():

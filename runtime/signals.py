@@ -1,4 +1,4 @@
-"""Ends a loop after a signal, between two steps."""
+"""Lets a loop end after a signal, between two of its steps."""
 
 import signal
 import threading

@@ -1,6 +1,6 @@
-"""Listening sockets for services, and connections to a host with several addresses.
+"""Binds listening sockets of services, and connects to hosts with several addresses.
 
-Commands bind their socket before they load anything else, to report a port in use at once.
+Commands bind their sockets before they load anything else, to report a port in use at once.
 """
 
 import ctypes
@@ -15,7 +15,7 @@ from typing import Any
 from trackfeatures.errors import UserError
 
 LOOPBACKS = {socket.AF_INET: "127.0.0.1", socket.AF_INET6: "::1"}
-CONNECT_S = 0.25  # least time for an attempt to connect to one address, if so much is left
+CONNECT_S = 0.25  # least time to connect to one address, unless less time remains in total
 PORT_TRIES = 8  # attempts to find one port that is free on every address of a host
 # Errors of a kernel or a host without IPv4 or without IPv6; the other family is used then.
 NO_FAMILY = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUPPORT)
@@ -27,7 +27,8 @@ Address = tuple[int, int, int, str, Any]  # a row of `socket.getaddrinfo`
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A bound TCP socket. Raises UserError if the address is in use, unknown or forbidden."""
+    """Bind a TCP socket to the first address of `host`. Raises UserError if the address is in use,
+    unknown or forbidden."""
     try:
         return _bind(_addresses(host, port, socket.AI_PASSIVE)[0])
     except (OSError, UnicodeError) as error:
@@ -35,10 +36,10 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def bind_all(host: str, port: int) -> list[socket.socket]:
-    """TCP sockets bound to the same port of all addresses of a host: "localhost" has two addresses.
+    """Bind TCP sockets to the same port of all addresses of `host` ("localhost" has two).
 
-    `::` also accepts IPv4. An address is left out if this machine lacks its family, unless no
-    address remains. Raises the same errors as `bind`.
+    `::` also accepts IPv4. An address is left out if this machine lacks IPv4 or IPv6, unless no
+    address remains. Raises UserError if an address is in use, unknown or forbidden.
     """
     for _ in range(PORT_TRIES):
         try:
@@ -125,10 +126,10 @@ def is_localhost(host: str) -> bool:
 def connect(
     place: tuple[str, int], timeout_s: float | None, source: tuple[str, int] | None = None
 ) -> socket.socket:
-    """A connection to the first address of (host, port) that accepts, within `timeout_s` in total.
+    """Connect to the first address of `place` (host, port) that accepts, in `timeout_s` in total.
 
-    Each address gets an equal share of the remaining time, but at least CONNECT_S if that is left.
-    Raises the first OSError. Takes the same arguments as `socket.create_connection`.
+    Each address gets an equal share of the remaining time, but at least CONNECT_S if that remains.
+    Raises the first OSError. It has the same arguments as `socket.create_connection`.
     """
     host, port = place
     addresses = _addresses(host, port)
@@ -172,7 +173,8 @@ def refuse_connections(listener: socket.socket) -> None:
 
 
 def address(listener: socket.socket, host: str) -> str:
-    """The URL of a bound socket, with its real port (the system's choice for port 0)."""
+    """The URL of the service on a bound socket, with the actual port (for port 0 the system chose
+    it)."""
     return url(host, listener.getsockname()[1])
 
 
@@ -183,7 +185,7 @@ def url(host: str, port: int) -> str:
 
 
 def shown_addresses(listeners: Iterable[socket.socket]) -> str:
-    """The addresses of bound sockets, as "127.0.0.1 and ::1"."""
+    """The addresses of bound sockets as text, such as "127.0.0.1 and ::1"."""
     return " and ".join(str(listener.getsockname()[0]) for listener in listeners)
 
 

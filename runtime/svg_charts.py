@@ -1,7 +1,7 @@
 """SVG charts for HTML pages: line plots, reliability diagrams, histograms and bars.
 
-A plot's SVG has coordinates from 0 to `SIDE`, y down, and is stretched over its box. Its labels are
-HTML, so that the text does not scale with the box. Pages with charts include `svg_charts.css`.
+The SVG of a plot has coordinates from 0 to `SIDE`, y down, and is stretched over its box. Labels
+are HTML, so that the text does not scale with the box. Pages with charts include `svg_charts.css`.
 """
 
 import math
@@ -14,16 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 
 SIDE = 1000.0
 LOG_FLOOR = 1e-9
-"""A logarithmic axis draws smaller values, 0 among them, at this value."""
+"""A logarithmic axis draws smaller values, including 0, at this value."""
 MAX_POINTS = 800
-"""Largest useful number of points of a line on a page."""
+"""Number of points of a line above which callers should thin out their data: screens are not
+wider."""
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Maps the values from `first` to `last` to [0, SIDE]; logarithmically with `log`."""
+    """An axis. Called with values, it maps those from `first` to `last` to SVG coordinates from 0
+    to SIDE; with `log` on a logarithmic scale."""
 
     first: float
     last: float
@@ -46,7 +48,7 @@ class Axis:
 
 
 def value_range(columns: Iterable[FloatArray], *, log: bool) -> tuple[float, float]:
-    """Smallest and largest finite value of `columns`, with a margin, for an axis."""
+    """Limits of an axis for the finite values of `columns`: smallest and largest, with a margin."""
     values = np.concatenate([column[np.isfinite(column)] for column in columns])
     if not len(values):
         return (LOG_FLOOR, 1.0) if log else (-1.0, 1.0)
@@ -98,7 +100,8 @@ class Line:
 
 @dataclass(frozen=True)
 class Plot:
-    """Lines over `shaded` intervals (from, to) of x; `log` makes the y axis logarithmic."""
+    """A plot of lines, with `shaded` intervals (from, to) of x behind them. With `log` the y axis
+    is logarithmic."""
 
     title: str
     lines: Sequence[Line]
@@ -172,7 +175,7 @@ def _points(x_axis: Axis, y_axis: Axis, x: FloatArray, y: FloatArray) -> list[st
 
 
 def runs(present: NDArray[np.bool_]) -> list[slice]:
-    """The parts between the gaps of a line, where `present` (N,) is true."""
+    """The slices of consecutive indices at which `present` (N,) is true."""
     edges = np.flatnonzero(np.diff(present, prepend=False, append=False))
     return [slice(a, b) for a, b in edges.reshape(-1, 2).tolist()]
 
@@ -220,13 +223,14 @@ BINS = 48
 SPLIT_COLOURS = {"train": "#3b6fd4", "test": "#e07a2e", "unseen": "#2a9d5c"}
 WIDTH, HEIGHT = 320, 120
 MARGIN, FOOT = 6, 18
-"""Space of a histogram on the left and right, and below it for the labels, in SVG units."""
+"""Space in a histogram in SVG units: MARGIN on the left and right, FOOT below for the labels."""
 
 
 def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) -> Markup:
-    """Histogram of the finite values (N,) of each split in `BINS` equal bins; NaN means inactive.
+    """Histogram, as an HTML figure, of the finite values (N,) of each split in `BINS` equal bins.
 
-    The bins of a split sum to one, so that splits of different sizes can be compared.
+    NaN means inactive. The bins of a split sum to one, so that splits of different sizes can be
+    compared.
     """
     finite = {split: column[np.isfinite(column)] for split, column in values.items()}
     filled = [column for column in finite.values() if column.size]
@@ -250,7 +254,8 @@ def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) 
 
 
 def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
-    """A row of bars for each name: its frame counts in the splits, ordered as `SPLIT_COLOURS`."""
+    """Bar chart as an HTML figure: a row for each name in `counts`, with a bar for its number of
+    frames in each split, in the order of `SPLIT_COLOURS`."""
     top = max((max(row) for row in counts.values()), default=0) or 1
     rows = []
     for name, row in counts.items():
@@ -267,7 +272,7 @@ def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
 
 
 def _outline(share: FloatArray, colour: str) -> str:
-    """A step outline of the bin heights `share` (BINS,) in [0, 1]."""
+    """SVG polygon of a histogram with the bin heights `share` (BINS,) in [0, 1]."""
     x = _bin_x(np.repeat(np.linspace(0.0, 1.0, BINS + 1), 2))
     y = HEIGHT - FOOT - np.pad(np.repeat(share, 2), 1) * (HEIGHT - FOOT - 4)
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
@@ -275,7 +280,8 @@ def _outline(share: FloatArray, colour: str) -> str:
 
 
 def _value_axis(low: float, high: float) -> str:
-    """Labels of both ends, and a line at zero if zero is between them."""
+    """SVG of a histogram's axis from `low` to `high`: labels at both ends, and a line at zero if
+    zero is between them."""
     drawn = _text(MARGIN, "start", f"{low:.3g}") + _text(WIDTH - MARGIN, "end", f"{high:.3g}")
     if low < 0.0 < high:
         zero = -low / (high - low)

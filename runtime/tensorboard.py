@@ -1,4 +1,4 @@
-"""Curves for TensorBoard: event files of scalars. Needs the package tensorboard."""
+"""Writes curves for TensorBoard: event files of scalars. It needs the package tensorboard."""
 
 import socket
 import time
@@ -11,9 +11,10 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 
 class TensorBoardWriter:
-    """Writes scalars to a new event file in `folder`; earlier points from `purge_step` on are void.
+    """Writes scalars to a new event file in `folder`. TensorBoard then ignores the points of other
+    files in it from `purge_step` on, for a training that continues from that step.
 
-    torch's SummaryWriter writes from a thread, which prints its own traceback on a full disk.
+    torch's SummaryWriter is not used: its thread prints a traceback if the disk is full.
     """
 
     def __init__(self, folder: Path, purge_step: int | None = None) -> None:
@@ -27,7 +28,7 @@ class TensorBoardWriter:
             self._add(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, step: int, values: dict[str, float]) -> None:
-        """Add one point to the curve of each name."""
+        """Add one point at `step` to the curve of each name in `values`."""
         scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
         self._add(Event(step=step, summary=Summary(value=scalars)))
 

@@ -1,4 +1,4 @@
-"""Threads of worker processes, so that all of them together fill the cores."""
+"""Limits the threads of worker processes, so that all processes together fill the cores."""
 
 import os
 
