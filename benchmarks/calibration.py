@@ -1,10 +1,11 @@
-"""Errors of `mtlnet calibrate FILM` on rendered films of known mounts.
+"""Errors of `mtlnet calibrate FILM` on rendered films with known camera mounts.
 
 Run: `python benchmarks/calibration.py [--films 10] [--seconds 60] [--keep FOLDER] [--json FILE]`.
-Claim: pitch and yaw within 0.3 degrees, height within 5 % (lane width known), for ten random mounts
-on roads with curves and hills. A film has ten frames a second: the calibration itself reads no more
-of a film of 25 or 30 (`mtlnet.calibration.film.SAMPLE_S`). Afterwards, where
-`../shared/real_roads` is: the pitch of one drive's pictures against the horizon of their labels.
+Claim: pitch and yaw are within 0.3 degrees and the height is within 5 % for ten random mounts, on
+roads with curves and hills and with known lane width. The films have 10 frames per second, because
+the calibration reads no more frames of a faster film (`mtlnet.calibration.film.SAMPLE_S`). If the
+folder `../shared/real_roads` exists, the pitch found from the pictures of one real drive is also
+compared with the horizon in the labels of these pictures (limit 0.5 degrees).
 """
 
 import csv

@@ -1,14 +1,15 @@
-"""SIGKILL of the whole process tree at random moments of a collection: no finished round is lost.
+"""Kills the processes of a collection at random moments and checks that no finished round is lost.
 
 Run: `python benchmarks/collect_killed.py [--kills 200] [--rounds 8] [--frames 20] [--seed 1]
-[--json FILE]`. A run of `datagen collect` is killed at a random moment and started again until it
-is complete; then the next folder is begun, until the number of kills is reached. Claim: every round
-that was finished at a kill has the same bytes and modification time at the end, and every dataset
-has the hash of an undisturbed run.
+[--json FILE]`. A run of `datagen collect` is killed (SIGKILL for all its processes) at a random
+moment and started again, until the dataset is complete. This is repeated with new folders until
+the number of kills is reached. Claim: every round that was finished at a kill has the same bytes
+and modification time at the end, and every dataset has the hash of an undisturbed run.
 
-A third of the kills come at any time of a run, which is mostly start-up. The others wait for a
-change in the folder (a round is begun, renamed, has its state, was the last one) and come within a
-short random time after it. `phases` counts the states in which the folder was found.
+A third of the kills come at a random time of the run; most of this time is start-up. The other
+kills come within a short random time after a change in the folder: a round is begun, is renamed,
+gets its state file, or was the last round. `phases` in the result counts the states in which the
+kills left the folder.
 """
 
 import hashlib

@@ -1,12 +1,12 @@
-"""Collection against the bare render loop of the same scenes, all cores, in one run.
+"""Speed of `datagen collect`, compared with only rendering the same frames, on all cores.
 
 Run: `python benchmarks/collection.py [--rounds 60] [--frames 2000] [--out FOLDER] [--json FILE]`.
-The dataset stays in `FOLDER/data` where a folder is given. Claim (on two cores with Mesa, 280 x
-210): at least 250 frames a second, physics, rendering, labels, JPEG, MCAP and checks included, and
-at least 0.75 of what drawing alone reaches. The bare loop draws the same frames, traffic and all,
-and does nothing else; its scenes are built before the clock starts. Ratios are of wall time, which
-decides, and of processor time, which depends less on other jobs. Sixty rounds are the default: with
-fewer, start-up and the end, when a core idles, weigh more than in real use.
+If FOLDER is given, the dataset stays in `FOLDER/data`. Claim (two cores, Mesa, 280 x 210 px): at
+least 250 frames per second, including physics, rendering, labels, JPEG, MCAP and checks, and at
+least 0.75 of the frames per second of rendering alone. Rendering alone draws the same frames with
+the same traffic; its scenes are built before its time is measured. The result has the ratios of
+wall time, which the claim concerns, and of processor time, which depends less on other jobs. With
+fewer than the default 60 rounds, start-up and the end, when a core is idle, have too much weight.
 """
 
 import contextlib

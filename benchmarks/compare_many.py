@@ -1,12 +1,14 @@
-"""Processor time of the public benchmark of controllers: ten own tracks and 13 of TORCS, without
-and with each of six disturbances, five seeds: 805 drives a controller.
+"""Processor time of the public benchmark of controllers.
 
-Run: `python benchmarks/compare_many.py [--controllers lqr,mpc] [--share 1] [--json FILE]`, some
-minutes a controller on two cores. It needs TORCS's tracks (`TORCS_TRACKS`). Each controller drives
-all tracks at once as `controllers compare --disturb --seeds 5` does, over `--share` of the steps of
-each drive; the times are extrapolated to all steps. Beside it one drive of the same steps is timed
-alone, and its numbers are compared. Claim: a controller takes at most 3 minutes of two cores, six
-minutes of processor time.
+For each controller it has 805 drives: 10 tracks of the project and 13 of TORCS, each without a
+disturbance and with each of six disturbances, with five seeds.
+
+Run: `python benchmarks/compare_many.py [--controllers lqr,mpc] [--share 1] [--json FILE]`. It takes
+some minutes per controller on two cores, and needs TORCS's tracks (`TORCS_TRACKS`). Each controller
+drives all tracks at once, as in `controllers compare --disturb --seeds 5`, for the share `--share`
+of the steps of each drive; the times are extrapolated to all steps. One drive is also timed alone
+and must give the same result. Claim: at most 6 minutes of processor time per controller, which is 3
+minutes on two cores.
 """
 
 import os

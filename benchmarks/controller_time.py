@@ -1,11 +1,10 @@
-"""The time of one controller step, and of a whole step on images.
+"""Time of one controller step, and of a whole control step with images.
 
 Run: `python benchmarks/controller_time.py [--track town] [--steps 3000] [--model RUN]
-[--json FILE]`. Each
-controller drives the track and its `update` is timed alone; then `lqr` drives on the answers of the
-service in another process, and all of a step is timed: the image, HTTP and the controller. Limits:
-MPC median 0.3 ms and p99 1 ms, LQR and RL p99 0.1 ms, a step on images p99 25 ms. Exit code 1 when
-one is missed.
+[--json FILE]`. Each controller drives the track, and only its `update` is timed. Then `lqr` drives
+on the answers of the service, which runs in another process. Here the whole step is timed:
+rendering, HTTP request and controller. Limits: MPC median 0.3 ms and p99 1 ms, LQR and RL p99 0.1
+ms, a step with images p99 25 ms. The exit code is 1 if a limit is missed.
 """
 
 import sys

@@ -1,17 +1,18 @@
-"""Controllers for an hour, while the service is restarted and its model is replaced.
+"""The service under load for an hour, with restarts and changes of the model, or with attacks.
 
     python benchmarks/endurance.py [--minutes 60] [--attacks] [--out FILE]
 
-Eight clients send 20 requests a second each. Every five minutes there is a rolling restart, every
-minute a reload, which alternates between two models. Claims: no admitted request is lost (every
-request is answered or refused, and the clients received as many answers as the service counted),
-and no answer is of the wrong model: it is bit-equal to what the model that it names predicts for
-that image, and this model was loaded at some moment of the request.
+Eight clients send 20 requests per second each. The workers are replaced every five minutes. The
+model is reloaded every minute, alternately from two runs. Claims: no admitted request is lost
+(every request is answered or refused, and the clients receive as many answers as the service
+counts), and no answer is wrong. An answer is right if it is bit-equal to the prediction of the
+model that it names, and that model was loaded at some moment between request and answer.
 
-`--attacks`: no restarts and no reloads, but malicious clients, which make all attacks of the tests
-in every minute (two hours: --minutes 120). Claims: no request is lost and no answer is wrong, the
-service's memory in the last minute is at most 1 % above that in the first, and p99 after the first
-minute is at most 1.2 times that of the first. The minute before the first is a warm-up.
+With `--attacks` there are no restarts and no reloads. Malicious clients make all attacks of the
+tests once per minute (for two hours: --minutes 120). Claims: no request is lost, no answer is
+wrong, the memory of the service in the last minute is at most 1 % above that in the first minute,
+and the p99 after the first minute is at most 1.2 times the p99 in it. The first minute begins after
+a minute of warm-up.
 """
 
 import os

@@ -1,10 +1,11 @@
-"""`mtlnet predict film.mp4 --out drawn.mp4`: pictures a second of a film of 1280 x 720 (H.264).
+"""Speed of `mtlnet predict film.mp4 --out drawn.mp4` for a film of 1280 x 720 px (H.264).
 
-Decoded, answered and drawn, on two cores; and where the CPU's time goes, each part by itself. The
-film is noise over moving colours of 6 Mbit/s, made by the FFmpeg program.
+The time includes decoding, inference, drawing and encoding on two cores. The result also has the
+processor time of each of these parts, measured separately. FFmpeg generates the film: noise over
+moving colours, 6 Mbit/s.
 
     python benchmarks/film.py [--seconds 20] [--model RUN] [--json FILE]
-    claim: at least 45 pictures a second
+    claim: at least 45 pictures per second
 """
 
 import os

@@ -1,11 +1,12 @@
-"""Time of a forward pass: the OpenVINO graph in bf16 and int8, compared with torch in float32.
+"""Time of a forward pass: OpenVINO graph in bf16 and in int8, compared with torch in float32.
 
-One image, one thread each; torch runs the published network channels-last, its fastest float32
-layout. The variants run in turns, so that other load on the machine affects all alike. The int8
-graph is calibrated on noise: its outputs are useless, its time is that of any int8 graph.
+Each pass has one image and one thread. torch runs the published network channels-last, its fastest
+float32 layout. The variants take turns, so that other load on the machine affects all of them
+equally. The int8 graph is calibrated on noise: its outputs are useless, but it takes as long as any
+int8 graph.
 
-All compute the network's nine outputs. For a model with an uncertainty head
-(`mtlnet.model.uncertainty_head`) the passes `with uncertainty` compute all that `serve` answers.
+All variants compute the network's nine outputs. If the model has an uncertainty head, the variants
+`with uncertainty` compute all outputs that `serve` needs.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
     claims: bf16 at most 0.40 of torch's time, int8 at most 0.20; with uncertainty 0.40 and 0.25

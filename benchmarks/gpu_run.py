@@ -1,17 +1,17 @@
-"""One prepared run on a machine with a GPU: collect, train, evaluate, test and time.
+"""A prepared run on a machine with a GPU: collect, train, evaluate, test and time.
 
-    python benchmarks/gpu_run.py --collect-wheels wheels      # beforehand, where there is a network
+    python benchmarks/gpu_run.py --collect-wheels wheels      # first, on a machine with a network
     python benchmarks/gpu_run.py --minutes 10 --wheels wheels --tracks torcs/tracks --out gpu_run
 
 The machine needs Python 3.12, torch, EGL on the GPU and the packages that
-`benchmarks/gpu/packages.toml` lists; it needs no network, no OpenVINO and no PyBullet.
-What is missing is printed before anything starts. The run ends within `--minutes`: each stage has a
-deadline, and the next ones run when one fails or is stopped. Results are written after each stage,
-to `gpu_run.json`, `curves*.csv` and `model/` (weights in float16 and card) in `--out`. The same
-command continues a stopped run, as long as `--work` is kept.
+`benchmarks/gpu/packages.toml` lists. It needs no network, no OpenVINO and no PyBullet. If something
+is missing, the command lists it and starts nothing. The run ends within `--minutes`: each stage has
+a deadline, and the next stages also run after a stage that failed or was stopped. After each stage
+the results are written to `--out`: `gpu_run.json`, `curves*.csv` and `model/` (weights in float16
+and card). The same command continues a stopped run if the folder `--work` still exists.
 
-`--rehearse`: all of it on a CPU, with a few frames and steps; its figures mean nothing.
-Exit codes: 0 all stages are done, 1 some are not, 3 something is missing.
+`--rehearse` runs everything on a CPU with a few frames and steps; its figures mean nothing.
+Exit codes: 0 if all stages are done, 1 if some are not, 3 if something is missing.
 """
 
 import argparse

@@ -1,10 +1,11 @@
-"""The shared-memory link: no torn message, no hang after a kill, no leaked segment; how fast it is.
+"""The shared-memory link: torn messages, hangs after a kill, leaked segments, and its speed.
 
 Run: `python benchmarks/link.py [--messages 1000000] [--patience 600] [--kills 200] [--steps 5000]
-[--json FILE]`; `--patience` in s for each count of messages. `--flood` and `--echo` are internal.
-Limits: of 10^6 messages in each direction, verified against a writer at full speed, none torn; with
-either side killed by SIGKILL at a random moment 200 times, the survivor knows within 2 s and no
-segment is left. As a control, a reader that ignores the sequence lock sees torn ones. Needs gcc.
+[--json FILE]`. `--patience` is the time limit in s for the messages of each direction. `--flood`
+and `--echo` are for internal use. Limits: of 10^6 messages in each direction, read while the writer
+writes at full speed, none is torn; in 200 trials in which one side is killed (SIGKILL) at a random
+moment, the other side notices it within 2 s and no segment remains. As a control, a reader without
+the sequence lock must see torn messages. Needs gcc.
 """
 
 import os

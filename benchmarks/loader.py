@@ -1,12 +1,13 @@
-"""Images per second from shuffled rounds to uint8 batches, and the time to open a dataset.
+"""Images per second read from shuffled rounds into uint8 batches, and time to open a dataset.
 
-Run: `python benchmarks/loader.py [--data DIR] [--json FILE]`. Claims, on two cores and warm: at
-least 6,500 images a second, at least twice a torch DataLoader with two workers on the same
-files, and five times the `mcap` reader item by item; 60 rounds open in at most 150 ms.
+Run: `python benchmarks/loader.py [--data DIR] [--json FILE]`. Claims, on two cores with the files
+in the page cache: at least 6,500 images per second, at least twice as many as a torch DataLoader
+with two workers on the same files, and five times as many as the `mcap` reader, which reads one
+image at a time; 60 rounds are opened in at most 150 ms.
 
 `decoder` is simplejpeg alone, one thread per core: the upper limit. `ours` is the training loader.
-`dataloader` is what a user would write: `simplejpeg` for each item, default collation, shuffled,
-two persistent workers; it uses our index (with the official reader it would be far slower).
+`dataloader` is a typical user's loader: `simplejpeg` for each item, default collation, shuffled,
+two persistent workers. It uses our index; with the official reader it would be far slower.
 """
 
 import os

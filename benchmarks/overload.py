@@ -1,15 +1,16 @@
 """The service under five times the load that it can answer, and with 1,000 slow connections.
 
-One worker runs on one core, a compiled load generator on another core. The loads: one client alone;
-as many clients as keep the engine busy (the peak); frames at five times the peak rate, sent whether
-or not earlier frames were answered; four clients at a fifth of the peak rate, without and with
-1,000 other connections whose requests never end. Each given peer is measured by the same script.
+One worker runs on one core and a compiled load generator on another core. The loads are: one client
+alone; as many clients as keep the engine busy (the peak); frames at five times the peak rate, sent
+without waiting for answers; four clients at a fifth of the peak rate, without and with 1,000 other
+connections whose requests never end. Each given peer is measured in the same way.
 
     python benchmarks/overload.py [--litserve PYTHON] [--bentoml PYTHON] [--mosec PYTHON]
         [--model RUN] [--int8] [--seconds 30] [--out FILE]
-    claims, for our service: p99 of admitted frames at most twice the p99 of one client alone plus
-    the time of a full queue; answers at least 0.95 of the peak; p99 of refusals at most 5 ms; slow
-    connections at most double the p99 of the four clients, none of whose requests fails
+    claims for our service: the p99 of admitted frames is at most twice the p99 of one client alone
+    plus the time of a full queue; at least 0.95 of the peak rate is answered; the p99 of refusals
+    is at most 5 ms; slow connections at most double the p99 of the four clients, and none of the
+    clients' requests fails
 """
 
 import os

@@ -1,7 +1,7 @@
-"""Two Ray workers on one host give the same dataset as one process.
+"""Compares a dataset that two Ray workers record on one host with that of one process.
 
-Run: `python benchmarks/ray_hash.py [--rounds 6] [--frames 200] [--json FILE]`. Claim: the dataset's
-hash and the bytes of every round are the same; the seconds of both are printed.
+Run: `python benchmarks/ray_hash.py [--rounds 6] [--frames 200] [--json FILE]`. Claim: the hashes of
+the datasets and the bytes of every round are equal. The result also has the time of both in s.
 """
 
 import sys

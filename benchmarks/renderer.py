@@ -1,10 +1,10 @@
-"""Images a second on one core: the camera alone, and the image environment against CarRacing-v3.
+"""Images per second on one core: camera alone, image environment, and Gymnasium's CarRacing-v3.
 
-Run: `python benchmarks/renderer.py [--json FILE]`, about three minutes. Claim, on one core of
-Mesa's llvmpipe: a complete step of `driverview/DriverView-v0` with its 280 x 210 image, shadows
-on, at least 150 times a second on every track and in both lights. The jobs take turns in one
-process pinned to one core; figures are medians over the turns, of processor time, or of wall time
-where a GPU renders. Resets are not counted. `--quick` takes one turn.
+Run: `python benchmarks/renderer.py [--json FILE]`; it takes about three minutes. Claim, on one core
+with Mesa's llvmpipe: at least 150 complete steps per second of `driverview/DriverView-v0` with an
+image of 280 x 210 px, on every track, in clear light and in heavy shadow. The jobs take turns in
+one process pinned to one core. The figures are medians over the turns, of processor time, or of
+wall time if a GPU renders. Resets are not counted. `--quick` measures one turn.
 """
 
 import os

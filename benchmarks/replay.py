@@ -1,10 +1,11 @@
 """Random episodes give bit-equal results in other processes and in vector environments.
 
-Run: `python benchmarks/replay.py [--episodes 100] [--json FILE]`, some five minutes on two
-cores. Claim: 100 episodes of random track, lanes, traffic, start, rate, controls, noise, sensors
-and, for every fifth, pictures in random light, give bit-equal observations, rewards, states, true
-features and info (a) in a process, (b) in another one that runs them in the opposite order and
-(c) in parallel in Gymnasium's `AsyncVectorEnv`. A SHA-256 over all steps is compared.
+Run: `python benchmarks/replay.py [--episodes 100] [--json FILE]`; it takes about five minutes on
+two cores. Claim: 100 episodes give bit-equal observations, rewards, states, true features and info
+(a) in one process, (b) in another process that runs them in the opposite order, and (c) in parallel
+in Gymnasium's `AsyncVectorEnv`. Their track, lanes, traffic, start, control rate, controls, noise
+and sensors are random; every fifth episode also has pictures in a random light. The SHA-256 over
+all steps is compared.
 """
 
 import hashlib

@@ -1,12 +1,14 @@
-"""What the service costs beside its model: our POST /features against a plain FastAPI handler.
+"""Overhead of the service: our POST /features compared with a plain FastAPI handler.
 
-Both take the same JPEG, decode it alike and answer from the same engine, which does nothing; the
-plain one has no limits, queue, thread, streams or metrics. Overhead is a request's time at the
-client less the decoding and answering that each server measures itself. Each is a process of its
-own, asked in turns over one connection, so that a busy machine disturbs both alike; the processor
-time that each takes a request is disturbed least.
+Both handlers get the same JPEG, decode it in the same way and use the same engine, which does
+nothing. The plain handler has no limits, queue, thread, streams or metrics. The overhead is the
+time of a request at the client minus the decoding and inference time that the server measures. Each
+server is a separate process. The client sends requests to them in turns, each over one connection,
+so that other load on the machine affects both equally. The result also has the processor time per
+request, which other load affects least.
 
-    python benchmarks/service.py [--quick] [--out FILE]     claim: overhead at most 0.75
+    python benchmarks/service.py [--quick] [--out FILE]
+    claim: our overhead is at most 0.75 of the plain handler's
 """
 
 import json

@@ -1,17 +1,17 @@
-"""The service under attack: what a well-behaved client still gets, and what it costs in memory.
+"""The service under attack: the answers that a well-behaved client gets, and the memory used.
 
-Each attack of `tests.serve.attacks.registry` is repeated for some seconds by a process that knows
-the token, while another process asks ten times a second over one connection, as a car does. Only
-loopback addresses are attacked; the attacker has another one of them than the client.
+Each attack of `tests.serve.attacks.registry` is repeated for `--seconds` by a process that knows
+the token. Meanwhile another process sends ten requests per second over one connection, like a car.
+Only services on loopback addresses are attacked; attacker and client have different addresses.
 
     python benchmarks/service_attack.py [--address 127.0.0.1:8000 --pid PID] [--seconds 60]
         [--settle 60] [--only NAME,NAME] [--model RUN] [--json] [--out FILE]
-    claims, in each attack: 99 of 100 requests answered, p99 at most three times that of a quiet
-    service, memory at most 60 MB above it beside the bodies' budget of 64 MiB, and at most 10 MB
-    above it within `--settle` seconds after it
+    claims for each attack: 99 of 100 requests are answered; p99 is at most three times the p99
+    without an attack; memory is at most 60 MB plus the bodies' budget of 64 MiB above the memory
+    without an attack, and at most 10 MB above it within `--settle` seconds after the attack
 
-Without an address a service is started, whose token is made for it; the token of one's own service
-is read from $DRIVERVIEW_TOKEN, its `--pid` is that of the command `serve`.
+Without --address the benchmark starts a service with a new token. The token of a running service is
+read from $DRIVERVIEW_TOKEN; `--pid` is the process id of its command `serve`.
 """
 
 import http.client

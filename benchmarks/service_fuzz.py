@@ -1,8 +1,9 @@
-"""A million damaged images through all that reads them in the service, in process.
+"""Decodes a million damaged images with the service's image decoder, without a server.
 
-Each is a JPEG or PNG with flipped bits, overwritten, cut or repeated parts, lies in its header, or
-another file behind it. It must give pixels or one of our own errors: anything else is a fault,
-whose seed and number make it again. Memory is read after a tenth of the images and at the end.
+Each image is a JPEG or PNG with flipped bits, overwritten, cut or repeated parts, wrong numbers in
+its header, or another file after it. The decoder must return pixels or raise ImageError. Any other
+result is a fault; its seed, part and number reproduce it. Memory is measured after a tenth of the
+images and at the end, and must grow by less than 1 %.
 
     python benchmarks/service_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """

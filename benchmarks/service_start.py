@@ -1,10 +1,11 @@
-"""How long `serve` takes from its command to its first "ready": as a user starts it, one worker.
+"""Time from the command `serve` to the first "ready", with one worker, as a user starts it.
 
-    python benchmarks/service_start.py [--model RUN] [--starts 5] [--json FILE]   claim: under 1 s
+    python benchmarks/service_start.py [--model RUN] [--starts 5] [--json FILE]
+    claim: less than 1 s
 
-Ready is /readyz, asked every 5 ms: the model is loaded, warm and has given its golden answer. The
-first start of all is not counted: it reads the programs from the disk. Without --model it is an
-untrained network.
+The service is ready when /readyz, requested every 5 ms, answers 200: the model is loaded, warm and
+has passed its check. The first start is not counted, because it reads the programs from the disk.
+Without --model the network is untrained.
 """
 
 import http.client

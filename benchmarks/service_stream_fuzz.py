@@ -1,9 +1,10 @@
-"""A million mutated byte streams through the service's HTTP and WebSocket connections, in process.
+"""Sends a million mutated byte streams to the service's HTTP and WebSocket protocols, in process.
 
-Each begins as a request, a handshake or both, from a grammar (`service_load/stream_grammar.py`) or
-from the attacks of the tests; WebSocket frames follow where the handshake was accepted. It arrives
-in parts, on a transport that behaves as uvloop's. Nothing may be raised, hang, be answered with
-500, be logged as an error, or be left behind; seed, part and number make a stream again.
+A stream begins with a request, a handshake or both. They come from the attacks of the tests or from
+a grammar (`service_load/stream_grammar.py`). WebSocket frames follow if the handshake was accepted.
+The stream arrives in parts, on a transport that behaves like uvloop's. It is a fault if the service
+raises an exception, hangs, answers 500, logs an error or leaves objects behind. Seed, part and
+number reproduce a stream.
 
     python benchmarks/service_stream_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """

@@ -1,15 +1,17 @@
-"""The speed of the service in this checkout beside that of another one, in one run.
+"""Speed of the service in this checkout compared with another checkout, in one run.
 
-Each of a number of pairs starts both with the same model, one after the other, the order changing
-from pair to pair, and measures: seconds from the command to the first answer, times of an answer
-over one connection, answers a second over eight, and the processor time of an answer.
+Each pair of measurements starts both services with the same model, one after the other; the order
+alternates from pair to pair. It measures the time from the command to the first answer in s, the
+times of an answer over one connection, the answers per second over eight connections, and the
+processor time of an answer.
 
     python benchmarks/service_versions.py --before CHECKOUT [--model RUN] [--pairs 9]
-        [--seconds 8] [--out FILE]          claim: no median of the pairs is over 3 % worse
+        [--seconds 8] [--out FILE]
+    claim: no median of the pairs is more than 3 % worse
 
-CHECKOUT is a clone of this repository at another commit; it runs in this environment. Without
---model the weights are untrained, and each of the two writes them in its own format, from the same
-seed. A model that is given must be in a format that both read.
+CHECKOUT is a clone of this repository at another commit; it runs in the environment of this one.
+Without --model the weights are untrained: each checkout writes them in its own format, from the
+same seed. A given model must have a format that both checkouts read.
 """
 
 import os

@@ -1,9 +1,10 @@
-"""Eight simulated hours of driving with resets: does the memory of the process grow?
+"""Growth of a process's memory during eight simulated hours of driving with resets.
 
-Run: `python benchmarks/soak.py [--hours 8] [--json FILE]`, about five minutes on one core. Claim:
-from after the warm-up, in which every kind of drive was done, the resident memory grows by less
-than 1 %. Environments are made, driven, reset and closed over and over: all of the project's own
-tracks, one to three lanes, 0 to 12 cars, and stretches of pictures, each with a camera of its own.
+Run: `python benchmarks/soak.py [--hours 8] [--json FILE]`; it takes about five minutes on one core.
+Claim: after the warm-up, which contains every kind of drive, the resident memory grows by less than
+1 %. Environments are created, driven, reset and closed repeatedly, on all tracks of the project,
+with one to three lanes and 0 to 12 cars. After every second drive follows a short one with pictures
+and a new camera.
 """
 
 import os

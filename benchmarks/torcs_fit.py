@@ -1,9 +1,9 @@
-"""The simulated car against the real TORCS: same control law, same tracks, the flying lap.
+"""Flying laps of the simulated car and in the real TORCS, with the same control law and tracks.
 
-Run: `TORCS_TRACKS=FOLDER python benchmarks/torcs_fit.py [--json FILE]`; FOLDER holds `tracks/` and
-the reference laps `drives/NAME-lqr.csv`. Limits: steps within 1 %, score per step within 0.004,
-mean |d| within 0.02 m, max |d| within 0.15 m. Exit code 1 when one is missed, 3 without reference
-laps.
+Run: `TORCS_TRACKS=FOLDER python benchmarks/torcs_fit.py [--json FILE]`. FOLDER contains `tracks/`
+and the reference laps `drives/NAME-lqr.csv`. Limits of the differences: steps 1 %, score per step
+0.004, mean |d| 0.02 m, max |d| 0.15 m (d: offset from the middle). The exit code is 1 if a limit is
+missed, 3 without reference laps.
 """
 
 import os

@@ -1,8 +1,8 @@
-"""Traffic of twelve cars for ten minutes on one, two and three lanes of every track.
+"""Traffic of twelve cars for ten minutes, with one, two and three lanes on every track.
 
-Run: `python benchmarks/traffic.py [--minutes 10] [--tracks town,highway] [--json FILE]`. Claim: no
-two cars ever overlap, whether the ego car drives or is parked in the rightmost lane; on two and
-three lanes cars change lanes. Exits 1 otherwise.
+Run: `python benchmarks/traffic.py [--minutes 10] [--tracks town,highway] [--json FILE]`. Claim: two
+cars never overlap, both with a driving ego car and with one parked in the rightmost lane, and cars
+change lanes on two and three lanes. The exit code is 1 if this does not hold.
 """
 
 import sys

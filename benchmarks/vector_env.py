@@ -1,13 +1,14 @@
-"""Steps a second of 256 cars in one vector environment, beside single environments and peers.
+"""Steps per second of 256 cars in one vector environment, of single environments and of peers.
 
-Run: `python benchmarks/vector_env.py [--json FILE]`, about three minutes on two idle cores. Claims:
-50,000 steps a second on one core and 90,000 on two without beams, 60,000 on two with 19 range beams
-in each step, at most 12 microseconds of the compiled control step a car.
+Run: `python benchmarks/vector_env.py [--json FILE]`; it takes about three minutes on two idle
+cores. Claims: 50,000 car steps per second on one core and 90,000 on two cores without beams, 60,000
+on two cores with 19 range beams in each step, and at most 12 microseconds per car for the compiled
+control step.
 
-On one core all environments take turns in one process pinned to it; a figure is the median over
-the turns of car steps per second of processor time, policy and resets included. Two threads are
-timed by the clock. CarRacing-v3 and racetrack-v0 run in vectors of two by Gymnasium's
-`SyncVectorEnv`, whose vectors in processes are slower on so few cores (`state_env.py`).
+On one core, all environments take turns in one process pinned to it. A figure is the median over
+the turns of car steps per second of processor time, including policy and resets. Runs on two
+threads are timed by wall time. CarRacing-v3 and racetrack-v0 run in vectors of two of Gymnasium's
+`SyncVectorEnv`; vectors in processes are slower on so few cores (`state_env.py`).
 """
 
 import os

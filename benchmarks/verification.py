@@ -1,8 +1,9 @@
-"""Time of `datagen verify --level full`, beside reading and hashing the same files, warm.
+"""Time of `datagen verify --level full`, and of only reading and hashing the same files.
 
 Run: `python benchmarks/verification.py [--data DIR] [--json FILE]`. Claim: at most 15 s for 120,000
-frames on two cores. Without `--data`, 60 rounds of 2,000 frames are made from a few collected ones.
-Exit code: 0 reached, 1 missed, 3 not measured (the dataset has fewer frames than the claim).
+frames on two cores, with the files in the page cache. Without `--data`, 60 rounds of 2,000 frames
+are made from a few collected rounds. Exit code: 0 if the claim is reached, 1 if it is missed, 3 if
+it is not measured (the dataset has fewer frames than the claim).
 """
 
 import hashlib

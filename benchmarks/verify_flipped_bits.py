@@ -1,9 +1,10 @@
-"""Single flipped bits in a dataset: `verify --level full` is to find every one.
+"""Flips single bits in a dataset; `datagen verify --level full` must find each of them.
 
 Run: `python benchmarks/verify_flipped_bits.py [--flips 1000] [--seed 0] [--data DIR] [--json
-FILE]`. One bit of one file is flipped, the dataset verified, the bit put back. Of four flips three
-are in the rounds, at any byte, and one in the other files: states, splits, the manifest and all
-files that it names. Without `--data` a few rounds are collected; a given dataset is copied first.
+FILE]`. One bit of one file is flipped, the dataset is verified, and the bit is restored. Three of
+four flips are in random bytes of the rounds, one is in another file: states, splits, the manifest
+or a file that the manifest lists. Without `--data` a few rounds are collected. A given dataset is
+copied first.
 """
 
 import shutil

@@ -1,8 +1,8 @@
-"""Processor time a frame in each kind of light, relative to the clear light of the same scene.
+"""Processor time per frame in each light, relative to the clear light of the same scene.
 
-Run: `python benchmarks/weather.py [--poses 40] [--json FILE]`; `--poses`: of each track. Claim:
-rain and snow take at most 1.25 times the processor time of the clear light, drawn in the calling
-thread on Mesa. The lights take turns, pose by pose.
+Run: `python benchmarks/weather.py [--poses 40] [--json FILE]`; `--poses` is the number of poses on
+each track. Claim: rain and snow take at most 1.25 times the processor time of the clear light, with
+Mesa drawing in the calling thread. The lights take turns at each pose.
 """
 
 import os

@@ -1,6 +1,6 @@
-"""How a benchmark is run and how it ends: its options, its figures as JSON, its exit code.
+"""Runs a benchmark as a command and ends it: options, figures as JSON, exit code.
 
-The exit codes are read by `make bench`, which lists missed and unmeasured benchmarks separately.
+`make bench` reads the exit codes and lists benchmarks that missed a claim or measured nothing.
 """
 
 import json

@@ -1,9 +1,10 @@
-"""The datasets of a GPU run: three to evaluate on, and one to train on.
+"""Defines and counts the datasets of a GPU run: three for evaluation, one for training.
 
-`test`: the tracks to train on, four fifths test rounds; its train rounds are those of the timed
-recipes. `unseen`: tracks never trained on. `random`: random roads of varied looks. `train`: half
-rounds on the tracks with roads of 4.0 m, half random roads of varied looks; collected in parts at
-once, for a plan of random roads takes one core a third of a minute, and then merged.
+`test` has the tracks that models are trained on; four fifths of its rounds are test rounds, and the
+timed recipes train on the others. `unseen` has tracks that no model is trained on. `random` has
+random roads of varied appearance. Half of the rounds of `train` are on the tracks, with lanes of
+4.0 m, and half on random roads of varied appearance. The parts of `train` are collected at the same
+time, because one core needs 20 s to plan random roads, and are then merged.
 """
 
 import json

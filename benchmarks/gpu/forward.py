@@ -1,10 +1,11 @@
-"""Time of a forward pass of the shipped network by batch, on a device; prints JSON.
+"""Time of a forward pass of the shipped network on a device, by batch size; prints JSON.
 
     python -m benchmarks.gpu.forward --device cuda --batches 1,2,4 --passes 50
 
-Median ms of all nine outputs, images in the device's memory as uint8: `f32` (no TF32), `bf16`
-(autocast) and, on a GPU, `bf16_graph`: the same recorded as a CUDA graph, which leaves the time of
-the kernels alone. A line a batch, so that what is done is kept.
+The times are medians in ms for all nine outputs of uint8 images in the device's memory: `f32`
+(without TF32), `bf16` (autocast) and, on a GPU, `bf16_graph`, a CUDA graph of `bf16`, which shows
+the time of the kernels alone. Each batch size has its own line of JSON, so that a stopped run keeps
+the lines of the finished sizes.
 """
 
 import argparse

@@ -1,6 +1,7 @@
-"""What a machine has for a GPU run, and what it lacks: packages, EGL on the GPU, tracks, a GPU.
+"""Finds out what a machine lacks for a GPU run: packages, EGL on the GPU, TORCS's tracks, a GPU.
 
-Each is asked in a process of its own: this one takes no GPU memory and no OpenGL context.
+Each question is answered by a separate process, so that this process uses no GPU memory and no
+OpenGL context.
 """
 
 import json

@@ -1,4 +1,7 @@
-"""The stages of a GPU run and their deadlines, in seconds from the start of the run."""
+"""The stages of a GPU run with their durations, deadlines and amounts of work.
+
+Times are in seconds; deadlines count from the start of the run.
+"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Runs the commands of a stage side by side until a deadline, and stops what still runs then."""
+"""Runs the commands of a stage in parallel until a deadline, then stops those that still run."""
 
 import os
 import signal

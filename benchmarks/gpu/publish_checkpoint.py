@@ -1,8 +1,9 @@
-"""Publishes the newest checkpoint of a training that was stopped; prints the number of its step.
+"""Publishes the newest checkpoint of a stopped training as a model; prints its step number.
 
     python -m benchmarks.gpu.publish_checkpoint RUN
 
-Without an uncertainty head: `mtlnet ship --data` fits one on other rounds, on any machine.
+The model has no uncertainty head. `mtlnet ship --data` can fit one later, on other rounds and on
+any machine.
 """
 
 import sys

@@ -1,7 +1,7 @@
-"""What a GPU run has found so far: `gpu_run.json` in its work folder and in its output folder.
+"""Stores the results of a GPU run: `gpu_run.json` in its work folder and in its output folder.
 
-Each stage is written as soon as it ends, so that a run that is stopped keeps what it has done, and
-a run that is started again in the same work folder goes on after its last finished stage.
+The file is written after each stage, so that a stopped run keeps the results of its finished
+stages. If the run is started again with the same work folder, it continues after them.
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""Runs the stages of a GPU run in turn, and reports the result of each."""
+"""Runs the stages of a GPU run one after another and reports the result of each stage."""
 
 import sys
 import time

@@ -1,6 +1,7 @@
-"""The stages of a GPU run: each runs commands of this project and returns what they found.
+"""The stages of a GPU run: each runs commands of this project and returns their results.
 
-Stages in the order of `plan.STAGES`; one that fails raises StageFailed, and the next ones run.
+The stages are in the order of `plan.STAGES`. A stage that fails raises StageFailed; the next stages
+still run.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The packages that a run on a bare machine needs, and the folder of wheels for what it lacks."""
+"""Lists the packages that a GPU run needs, and downloads and installs wheels of missing ones."""
 
 import importlib
 import re

@@ -1,7 +1,7 @@
-"""A dataset of any size out of a few collected rounds: the same images, in another order each.
+"""Makes a dataset of any size from a few collected rounds: each round repeats their frames.
 
-Collecting 120,000 frames takes minutes; for reading and checking them only their number and their
-bytes count. Times and states are those of a real dataset; what a frame shows repeats.
+Collecting 120,000 frames takes minutes. To time reading and checking, only the number of frames and
+their bytes matter. Log times and state files are as in a real dataset.
 """
 
 import hashlib

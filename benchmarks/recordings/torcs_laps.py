@@ -1,8 +1,9 @@
-"""The simulated car against the real TORCS: one control law, one track, one flying lap each.
+"""Compares a flying lap of the simulated car with one in the real TORCS, under one control law.
 
-A recording is a CSV of `drives/`: laps of TORCS under `controllers.laws.torcs_feedback`. The same
-law drives the simulator from the same start and at the same times: TORCS ticks every 20 to 22 ms,
-so that its control steps take 40 to 66 ms, which matters for gains as high as these.
+A recording is a CSV file in `drives/`: laps in TORCS under `controllers.laws.torcs_feedback`. The
+same law drives the simulator from the same start, with the recorded times of the control steps. The
+times matter with these high gains: TORCS sends its state every 20 to 22 ms, so its control steps
+take 40 to 66 ms.
 """
 
 import itertools

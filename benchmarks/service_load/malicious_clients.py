@@ -1,6 +1,6 @@
-"""Malicious clients beside well-behaved ones: all attacks of the tests in turn, once a minute.
+"""Runs malicious clients against a service: all attacks of the tests one after another, per minute.
 
-They come from an address of their own, on this machine.
+They have a loopback address of their own, so that the service can tell them from other clients.
 """
 
 import multiprocessing

@@ -1,4 +1,7 @@
-"""The model behind BentoML, as its manual shows it for a raw image body; run by `bentoml serve`."""
+"""The model behind BentoML, set up as its manual shows for a raw image body.
+
+`bentoml serve` runs this file.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any

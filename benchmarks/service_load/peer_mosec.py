@@ -1,4 +1,4 @@
-"""The model behind mosec, as its manual shows it: one stage, a process each, no batching."""
+"""The model behind mosec, set up as its manual shows: one stage, several processes, no batching."""
 
 import sys
 from typing import Any

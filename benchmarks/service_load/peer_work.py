@@ -1,4 +1,4 @@
-"""What each peer does with a JPEG: it has the engine, the precision and the answer of ours."""
+"""Answers a JPEG in each peer with the same engine, precision and answer as in our service."""
 
 import os
 from pathlib import Path

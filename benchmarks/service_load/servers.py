@@ -1,6 +1,6 @@
-"""The service and its peers as processes, and a load on them: what several benchmarks share.
+"""Starts the service and its peers as processes, and puts load on them, for several benchmarks.
 
-A peer runs in an environment of its own, which has it, openvino, numpy and simplejpeg.
+A peer runs in a separate Python environment with the peer, openvino, numpy and simplejpeg.
 """
 
 import http.client

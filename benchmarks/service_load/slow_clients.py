@@ -1,8 +1,9 @@
 """Clients that hold connections open: half never end their headers, half never end their body.
 
-    python benchmarks/service_load/slow_clients.py PORT COUNT      until it is killed
+    python benchmarks/service_load/slow_clients.py PORT COUNT      # runs until it is killed
 
-Each sends a byte a second, and dials again a second after it was cut.
+Each client sends one byte per second. If the server closes its connection, the client connects
+again a second later.
 """
 
 import random

@@ -1,4 +1,4 @@
-"""A grammar of what clients send over HTTP/1.1 and WebSockets, of right and of wrong productions.
+"""Generates random byte streams of HTTP/1.1 and WebSocket clients by a grammar, valid and invalid.
 
 Sources: RFC 9112 (messages, chunked coding), RFC 9110 (fields), RFC 6455 (handshakes, frames).
 """

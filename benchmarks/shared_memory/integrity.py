@@ -1,4 +1,4 @@
-"""Messages of the link, written at full speed and verified by the other side: none is torn."""
+"""Counts torn messages of the link: one side writes at full speed, the other side verifies."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Either side of the link killed by SIGKILL: how soon the other knows, and what is left behind."""
+"""Kills either side of the link (SIGKILL); times how soon the other side notices, finds remains."""
 
 import random
 import signal

@@ -1,4 +1,4 @@
-"""What the benchmarks of the link share: the C program, servers as processes, names."""
+"""Shared code of the link's benchmarks: the C program, servers as processes, segment names."""
 
 import subprocess
 import sys
