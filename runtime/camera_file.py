@@ -26,7 +26,7 @@ NOT_ASSUMED: dict[str, Any] = {
     "coefficients": (),
     "height_std": 0.0,
 }
-"""Values of these fields if a file omits them. Others then have the default camera's values."""
+"""Values of these fields if a file omits them. Other omitted fields keep the default camera's."""
 LIMITS_DEG = {"pitch_deg": 30.0, "roll_deg": 30.0, "yaw_deg": 180.0}
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "k", "mtx")
 COEFFICIENT_KEYS = (

@@ -48,7 +48,7 @@ class Axis:
 
 
 def value_range(columns: Iterable[FloatArray], *, log: bool) -> tuple[float, float]:
-    """Limits of an axis for the finite values of `columns`: smallest and largest, with a margin."""
+    """Limits (low, high) of an axis that shows all finite values of `columns` with a margin."""
     values = np.concatenate([column[np.isfinite(column)] for column in columns])
     if not len(values):
         return (LOG_FLOOR, 1.0) if log else (-1.0, 1.0)
@@ -139,8 +139,8 @@ def line_plot(plot: Plot) -> Markup:
 
 
 def reliability_diagram(title: str, predicted: FloatArray, observed: FloatArray) -> Markup:
-    """Observed errors over predicted standard deviations (both (N,)), on logarithmic axes with the
-    diagonal."""
+    """Chart, as an HTML figure, of observed errors (N,) over predicted standard deviations (N,), on
+    logarithmic axes with the diagonal."""
     both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
     low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
     x_axis, y_axis = Axis(low, high, log=True), Axis(high, low, log=True)

@@ -46,10 +46,10 @@ class ServiceConfig:
     """Options of the command `serve`."""
 
     model: str = "default"
-    """A run's folder, its name in runs/, "latest" or "default"."""
+    """A run's folder, its name in runs/, "latest", or the name of a model that ships."""
     host: str = "127.0.0.1"
     port: int = 8000
-    """0 chooses a free port; the first line on stderr shows it."""
+    """Port to listen on; 0 stands for any free port, which the first line on stderr shows."""
     workers: int = 1
     insecure: bool = False
     """Allow a `host` that other machines can reach although there is no token."""

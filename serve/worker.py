@@ -52,7 +52,7 @@ class SupervisorConnection:
                 logger.debug("the supervisor has ended")
 
     def send_loaded(self, generation: int, engine: Engine) -> None:
-        """Report the loaded engine for this generation of weights."""
+        """Tell the supervisor which engine was loaded for this generation of weights."""
         self.send(
             loaded=generation,
             model=engine.card.model_hash,
@@ -104,7 +104,7 @@ def load(folder: Path, expected: str | None) -> Engine:
 
 
 def send_ready(supervisor: SupervisorConnection) -> None:
-    """Report that the worker now answers images."""
+    """Tell the supervisor that this worker now answers images."""
     # The objects loaded so far are permanent. With them a full garbage collection delays all
     # clients by 50 to 80 ms, several times per minute; without them it takes 3 ms.
     gc.freeze()

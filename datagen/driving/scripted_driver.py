@@ -106,8 +106,8 @@ class ScriptedDriver:
         return self._law.steer(state, target, curvature, atan(slope))
 
     def _limit_lateral_speed(self, wanted: float, to_middle: float) -> float:
-        """The next target offset (m): from the last target towards `wanted`, at most at
-        `MAX_LATERAL_SPEED`."""
+        """Move the target offset (m) towards `wanted` for one control step, at most at
+        `MAX_LATERAL_SPEED`, and return it. The first target starts at `to_middle`."""
         before = to_middle if self._steered_for is None else self._steered_for
         most = MAX_LATERAL_SPEED * self._dt
         self._steered_for = min(max(wanted, before - most), before + most)

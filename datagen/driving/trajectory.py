@@ -94,7 +94,7 @@ def _middle(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArra
 
 
 def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """Constant offsets anywhere on the road, changed every 60 to 140 m."""
+    """A course of constant offsets anywhere on the road; the offset changes every 60 to 140 m."""
     limit = max_offset(road)
     offset = rng.uniform(-limit, limit)
 
@@ -109,7 +109,7 @@ def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArr
 
 
 def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """Sine waves within a lane or over the width of the road; wide waves are long."""
+    """A course of sine waves within a lane or over the width of the road; wide waves are long."""
     half = road.lanes * road.lane_width / 2
     if rng.uniform() < 0.5:
         middle = tf.lane_centre(int(rng.integers(road.lanes)), road.lanes, road.lane_width)
@@ -125,7 +125,7 @@ def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray
 
 
 def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A lane change every 50 to 130 m; on a one-lane road, a change of side within the lane."""
+    """A course with a lane change every 50 to 130 m; on one lane, with a change of side in it."""
     centres = np.array([tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes)])
     if road.lanes == 1:
         centres = np.array([-1.1, 1.1])

@@ -87,7 +87,7 @@ class CollectProgress:
 
 
 class FramesPerSecond(ProgressColumn):
-    """Column of the progress bar: frames per second, at the end those of the whole run.
+    """Column of the progress bar: frames per second, recently or, at the end, over the whole run.
 
     Frames from earlier runs (the field `begun` of the task) do not count.
     """

@@ -49,7 +49,7 @@ class RoundPlan:
     """Number of other cars."""
     trajectory: str
     lights: tuple[str, ...]
-    """Light of each scene. Stretches show the scenes in order and start again after the last."""
+    """Name of the light of each scene. A round shows its scenes in order, again and again."""
     stretch: int
     """Number of frames between two changes of the scene; 0: the scene never changes."""
     speed_kmh: float

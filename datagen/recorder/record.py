@@ -166,7 +166,7 @@ def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[Frame
 
 
 def scenery(plan: RoundPlan, number: int) -> Scenery:
-    """Seed, light and look of scene `number` (from 0) of a round. No seed is used twice."""
+    """Seed, light and look of scene `number` (from 0) of a round. Each scene has its own seed."""
     light = Light.named(plan.lights[number], np.random.default_rng([plan.seed, 2, number]))
     look = plan.varied.scenes[number] if plan.varied else None
     return plan.seed + number * SCENERY_SEED_STRIDE, light, look

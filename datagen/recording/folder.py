@@ -106,12 +106,12 @@ def require_merged(folder: Path) -> None:
 
 
 def round_path(folder: Path, round_id: str) -> Path:
-    """The file of a finished round. Raises BadName."""
+    """Path of the file of a finished round. Raises BadName if the id cannot be a file name."""
     return folder / "rounds" / f"{require_name(round_id, 'round id')}.mcap"
 
 
 def state_path(folder: Path, round_id: str) -> Path:
-    """The file with the hashes of a finished round. Raises BadName."""
+    """Path of the file with the hashes of a finished round. Raises BadName."""
     return folder / "state" / f"{require_name(round_id, 'round id')}.json"
 
 
@@ -135,7 +135,8 @@ def partial_path(folder: Path, round_id: str) -> Path:
 
 
 def publish(folder: Path, partial: Path, state: RoundState) -> None:
-    """Move a checked round into `rounds/` and write its state; safe against a power cut."""
+    """Move a checked round into `rounds/`, then write its state. After a power cut in between, the
+    round has no state and counts as unfinished."""
     atomic_move(partial, round_path(folder, state.id))
     write_state(folder, state)
     discard_partial(folder, state.id)

@@ -98,7 +98,7 @@ def light_per_frame(index: RoundIndex) -> NDArray[np.str_]:
 
 
 def concatenate(parts: list[Labels]) -> Labels:
-    """The rows of all `parts`, one after the other."""
+    """Join the labels in `parts`, in their order."""
     return Labels(
         **{
             f.name: np.concatenate([getattr(part, f.name) for part in parts])

@@ -3,7 +3,7 @@
 CODECS = ("jpeg", "png")
 UNSEEN = "unseen"
 SIDES = ("train", "test", UNSEEN)
-"""Sides of a split. `unseen` holds rounds of tracks that no model is trained on."""
+"""Sides of a split. `unseen` has rounds on tracks that no model is trained on."""
 MIDDLE = "middle"
 """The trajectory of the paper's drives: the middle of the middle lane. Training plans have none."""
 DRIVEN = "driven-"

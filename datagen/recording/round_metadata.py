@@ -40,7 +40,7 @@ class RoundHeader:
     traffic: int
     trajectory: str
     lights: tuple[str, ...]
-    """Name of the light of each stretch of the round. After the last one they are repeated."""
+    """Names of the lights of successive stretches; after the last one they start again."""
     speed_kmh: float
     stretch: int = 0
     """Number of frames in a row with the same scenery and light; 0: the whole round."""

@@ -1,4 +1,4 @@
-"""Splits: they assign rounds to training, testing, or testing on unseen tracks.
+"""Reads, writes, checks and creates splits, which assign rounds to the sides train, test, unseen.
 
 A split is by round, never by frame. `splits/NAME.json` holds the ids of each side. No round, seed
 or content hash may be on two sides (a leak).

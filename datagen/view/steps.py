@@ -43,7 +43,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps of a round, as a sequence: `steps[0]`, `len(steps)`, `for step in steps`."""
+    """The frames of a round as a sequence: `steps[0]`, `len(steps)`, `for step in steps`."""
 
     index: RoundIndex
 
@@ -94,13 +94,13 @@ class Steps:
 
     @cached_property
     def lights(self) -> list[str]:
-        """Name of the light at each step."""
+        """Name of the light at each frame."""
         lights: list[str] = light_per_frame(self.index).tolist()
         return lights
 
     @cached_property
     def times_s(self) -> list[float]:
-        """Simulated time of each step since the start of the round, s."""
+        """Simulated time of each frame since the start of the round, s."""
         times = self.index.messages[CAMERA].log_time.tolist()
         if not times:
             raise DatasetError(f"{self.index.path} has no frames; record the round again")

@@ -30,7 +30,7 @@ class Access:
         rate_limiter: RateLimiter,
         count_refusal: Callable[[Problem, str, str], None],
     ) -> None:
-        """`count_refusal` gets the problem, the request's id and the client's address."""
+        """`count_refusal` is called with the problem, the request's id and the client's address."""
         self._rate_limiter = rate_limiter
         self._hosts = HostCheck(limits)
         self._token = limits.token

@@ -54,14 +54,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class StreamOptions:
-    """The options of a WebSocket from its handshake; `deadline_ms` is the client's text."""
+    """The options in the handshake of a WebSocket; `deadline_ms` is the text that was sent."""
 
     defaults: RequestOptions
     protocol: str | None
     deadline_ms: bytes | None
     client: str
     pause_s: float = 0.0
-    """Pause before the next message is received; above 0 after a refusal."""
+    """Time in s to wait before the next message is received; above 0 after a refusal."""
 
 
 class Stream:

@@ -175,7 +175,7 @@ class FrameQueue:
 
     def _enqueue_large(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
         """Admit a large image and queue its frame; the admission ends with the frame's result.
-        Returns and raises as `_enqueue` does."""
+        Returns the function that refuses a replaced frame, if there is one. Raises Problem."""
         done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
 
         def finish(result: FrameResult | Exception) -> None:
@@ -226,7 +226,8 @@ class FrameQueue:
         return superseded
 
     def _dispatch(self) -> None:
-        """Process one frame on the loop if the module's conditions hold; else wake the thread."""
+        """Process a frame on the loop if the engine is fast and no other frame waits (on one core
+        other small frames may wait); else wake the thread."""
         fast = self._fast_frames >= INLINE_AFTER and self.loaded is self._fast_engine
         inline = 0 < self._waiting.count <= (self._capacity + 1 if self.single_core else 1)
         if not (fast and inline and self._waiting.all_small):

@@ -50,7 +50,7 @@ class Phase(Enum):
 
 
 class GuardedProtocol(HttpToolsProtocol):
-    """One HTTP connection."""
+    """One HTTP connection with a deadline for each of its phases."""
 
     def __init__(self, *arguments: Any, guard: ConnectionGuard, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -110,7 +110,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.cycle.transport = LingeringTransport(self)  # type: ignore[assignment]
 
     def end(self) -> None:
-        """Close after the last reply; if the client can still be sending, once it has closed."""
+        """Close after the last reply; if the client can still be sending, wait until it closes."""
         lingers = self.guard.draining or self._phase is Phase.BODY
         (self.linger if lingers else self.transport.close)()
 

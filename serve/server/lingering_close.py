@@ -13,7 +13,7 @@ class LingeringConnection(Protocol):
     transport: asyncio.Transport
 
     def end(self) -> None:
-        """Close after the last reply; if the client can still be sending, once it has closed."""
+        """Close after the last reply; if the client can still be sending, wait until it closes."""
 
 
 class LingeringTransport:

@@ -40,7 +40,7 @@ TEXT_COST = 4  # bytes of memory per byte of a text: one emoji makes Python use 
 
 
 class GuardedWebSocket(WebSocketsSansIOProtocol):
-    """One WebSocket connection."""
+    """One WebSocket connection with deadlines and limits."""
 
     def __init__(self, *arguments: Any, guard: ConnectionGuard, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -112,7 +112,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
                 self.loop.call_soon(self._read_on)
 
     def _read_on(self) -> None:
-        """Read again after PAUSE_BYTES, unless something else has paused reading meanwhile."""
+        """Resume reading after the pause that follows a large read, unless reading was also paused
+        for another reason."""
         if not (self.read_paused or self.transport.is_closing()):
             self.transport.resume_reading()
 

@@ -26,7 +26,7 @@ FOOT_SLACK_M = 0.005
 """Tolerance added to this difference, m."""
 
 _Lines = tuple[int, float, LineOffsets]
-"""Number of lanes, their width in m, and line offsets as in `trackfeatures.measure`."""
+"""Number of lanes, lane width (m), and two offsets (m) of the lines of each marking."""
 
 
 def label_problems(

@@ -168,7 +168,7 @@ def _recorded_frames(data: bytes) -> int:
 
 
 def _write(path: Path, header: RoundHeader, intact: IntactFrames, recovery: Recovery) -> RoundState:
-    """Write the round as `RoundWriter` would have, with gaps where frames are damaged."""
+    """Write the intact frames as a round file with their original log times; return its state."""
     content = hashlib.sha256()
     with RoundFile(path, header) as file:
         for topic, log_time, number, payload in _messages(header, intact):

@@ -131,7 +131,8 @@ def _unexpected_files(folder: Path) -> Iterator[str]:
 
 
 def _duplicate_rounds(rounds: list[RoundIndex]) -> Iterator[str]:
-    """Yield a problem for each file with the name of another round, and for equal contents."""
+    """Yield a problem for each file whose name is not the id of its round, and for each file with
+    the same images and labels as an earlier one."""
     contents: dict[str, str] = {}
     for index in rounds:
         name, header = index.path.name, index.header

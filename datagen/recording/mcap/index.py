@@ -193,9 +193,9 @@ class RoundIndex:
     result: RoundResult
     messages: dict[str, Messages]
     summary: Summary | None
-    """None if the file was read with the official reader."""
+    """Summary section of the file; None if the official reader was used."""
     recovery: Recovery | None = None
-    """Set if the round was recovered from a damaged file: frames are missing."""
+    """Recovery record of a round that was recovered from a damaged file and lacks frames."""
 
 
 def open_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:

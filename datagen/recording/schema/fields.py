@@ -1,4 +1,4 @@
-"""Unit, frame, reference point, limits and meaning of absence of every recorded field.
+"""Describes every recorded field: unit, frame, reference point, limits and meaning of absence.
 
 The JSON schema of a dataset and the tables of its card are generated from this. Names and types of
 the fields are the same as in `proto/driverview.proto`.

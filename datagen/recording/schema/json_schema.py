@@ -23,7 +23,7 @@ INTEGERS = (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_UINT32)
 
 @lru_cache(maxsize=1)
 def schema_text() -> str:
-    """The text of the schema file."""
+    """The content of the schema file: the result of `json_schema` as indented JSON."""
     return json.dumps(json_schema(), indent=1) + "\n"
 
 

@@ -167,7 +167,7 @@ def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> by
 
 
 def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> bytes:
-    """The ego pose in the world, and the camera pose on the car."""
+    """Two coordinate transforms: the car's pose in the world, and the camera's pose on the car."""
     message = FrameTransforms()
     _add_transform(
         message, WORLD, EGO, (ego.x, ego.y, ego.z), quaternion(ego.roll, ego.pitch, ego.yaw), time
