@@ -19,10 +19,10 @@ NATURAL_FREQUENCY = 2.2  # rad/s of the lateral motion
 DAMPING = 0.85
 MAX_LATERAL_SPEED = 2.4  # m/s, of the target offset
 MAX_PATH_ANGLE = 0.16  # rad, between the path and the road
-LANE_CHANGE_SPEED = 1.4  # m/s sideways, at most
-LANE_CHANGE_RESPONSE = 1.0  # 1/s
+LANE_CHANGE_SPEED = 1.4  # m/s: largest lateral speed of a lane change
+LANE_CHANGE_RESPONSE = 1.0  # 1/s: lateral speed for each metre that remains
 PASSING_DISTANCE_M = 2.4  # lateral, between the centres of cars side by side
-LANE_CHANGE_PAUSE_S = 4.0
+LANE_CHANGE_PAUSE_S = 4.0  # least time between two lane changes
 SLOWER_BY = 1.5  # m/s: a car ahead is overtaken if it is slower than the target speed by this much
 
 

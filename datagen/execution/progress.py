@@ -121,7 +121,7 @@ def progress_bar(
     task = bar.add_task(f"0/{rounds} rounds", total=frames, begun=0)
 
     def update(done_frames: int, done_rounds: int) -> None:
-        if not bar.live.is_started:  # not earlier: errors before the start print no bar
+        if not bar.live.is_started:  # not earlier, so that errors before the start print no bar
             bar.console.print(heading)
             bar.start()
             bar.update(task, begun=done_frames)

@@ -31,7 +31,7 @@ NINE_TRACKS = (
 g-track-3. The other three are our choice."""
 DRIVEN_TRACKS = ("g-track-3", "dirt-3")
 LIGHTS = ("clear", "heavy-shadow")
-SPEED_KMH = 65.0  # the paper's vehicles: 60 to 75 km/h
+SPEED_KMH = 65.0  # the paper's vehicles drive at 60 to 75 km/h
 
 
 def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:

@@ -226,8 +226,8 @@ class FrameQueue:
         return superseded
 
     def _dispatch(self) -> None:
-        """Process a frame on the loop if the engine is fast and no other frame waits (on one core
-        other small frames may wait); else wake the thread."""
+        """Process a small frame on the loop if the engine is fast and no other frame waits (with
+        one core, other small frames can wait); else wake the thread."""
         fast = self._fast_frames >= INLINE_AFTER and self.loaded is self._fast_engine
         inline = 0 < self._waiting.count <= (self._capacity + 1 if self.single_core else 1)
         if not (fast and inline and self._waiting.all_small):

@@ -67,7 +67,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._fault: Problem | None = None  # why a callback has stopped the parser
         self._body_lingers = False  # the last reply was sent before the request's end arrived
         self._trailer_bytes = self._chunks = 0
-        self._part_bytes = self._part_requests = 0  # of the latest part
+        self._part_bytes = self._part_requests = 0  # bytes and requests in the latest part
         # Bytes since the last complete request, including the part in which that request ended.
         self._unread_bytes = 0
         self._known_bytes = 0  # the share of `_unread_bytes` up to the latest part with body bytes

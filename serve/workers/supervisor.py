@@ -61,7 +61,7 @@ class Supervisor:
         self._folder = plan.resolve(plan.model)
         self._model = plan.model
         self._model_hash: str | None = None
-        self._last_generation = 0  # of all reloads, including failed reloads
+        self._last_generation = 0  # number of the last reload, also if it failed
         self._change_lock = asyncio.Lock()
         self._stopping = asyncio.Event()
         self._has_terminal = _has_terminal()

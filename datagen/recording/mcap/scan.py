@@ -67,7 +67,7 @@ class _Scanner:
         self._topics: dict[int, str] = {}  # by channel
         self._entries: dict[
             int, list[int]
-        ] = {}  # of the last chunk, by channel: log times and offsets
+        ] = {}  # log times and offsets of the last chunk's messages, by channel
         self._found = Scan(size=size)
 
     def run(self) -> Scan:
