@@ -1,7 +1,7 @@
-"""VTORCS: tracks, physics, traffic, sensors, camera and the Gymnasium environments.
+"""VTORCS, the driving simulator: tracks, physics, traffic, sensors, camera, Gymnasium environments.
 
 The environments are registered with Gymnasium when this package is imported after `gymnasium`, or
-by `import simulator.env`; Gymnasium 1.0 and later does not search packages for environments.
+when `simulator.env` is imported. Gymnasium 1.0 and later does not search packages for environments.
 """
 
 import sys
@@ -14,13 +14,13 @@ VECTORS = {
     "driverview/LateralControl-v0": "simulator.env.vector:LateralControlVector",
     "driverview/DriverView-v0": "simulator.env.vector:DriverViewVector",
 }
-"""Classes that step many cars in one call, for `gymnasium.make_vec`."""
+"""Classes for `gymnasium.make_vec`, which step many cars in one call."""
 MAX_STEPS = 6500
-"""The paper's longest episode, in control steps."""
+"""Longest episode of the paper (forza), in control steps."""
 
 
 def register_environments() -> None:
-    """Register both environments; those already registered stay as they are."""
+    """Register both environments with Gymnasium, unless they are registered already."""
     import gymnasium
 
     for name, entry_point in ENVIRONMENTS.items():

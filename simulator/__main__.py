@@ -1,4 +1,4 @@
-"""`python -m simulator`: the same as the `simulator` command."""
+"""Runs the `simulator` command for `python -m simulator`."""
 
 from simulator.cli import main
 

@@ -1,4 +1,4 @@
-"""The type of arrays of floats, as tracks, physics and camera use them."""
+"""Defines the type of the float64 arrays that tracks, physics and camera use."""
 
 import numpy as np
 from numpy.typing import NDArray

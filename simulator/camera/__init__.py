@@ -1,4 +1,4 @@
-"""The renderer: camera images of the simulated road under different lights and weather."""
+"""The renderer, which draws camera images of the simulated road in different light and weather."""
 
 from simulator.camera.core.camera import Camera, check_size, open_camera
 from simulator.camera.core.optics import VIEWS

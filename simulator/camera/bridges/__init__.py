@@ -1,1 +1,1 @@
-"""Bridges over the road: where they stand and how they are built."""
+"""Bridges over the road: selects their positions and builds their triangles."""

@@ -1,7 +1,7 @@
-"""Bridges over the road: where they stand, and the frame in which each is built.
+"""Selects the positions of the bridges over the road, and builds each bridge there.
 
-A bridge's own frame has its origin on the centre line, x along the road, y to the left, z up,
-metres. The styles are in `bridges.styles`, the shadows in `scene.shadow_mask`.
+The frame of a bridge has its origin on the centre line of the road, x along the road, y to the
+left, z up, metres. `bridges.styles` builds the triangles, `scene.shadow_mask` the shadows.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,21 @@ from simulator.camera.scene.themes import Theme
 
 CLEARANCE_M = 5.4
 HEADROOM_M = 2.5
-"""Least clearance beside the asphalt, where an arch starts."""
+"""Least clearance at the wall line; the sides of an arch are lower than its middle."""
 APART_M = 140.0
 KEEP_FREE_M = 3.0
-"""Least distance of trees and props from a bridge."""
+"""Least distance of trees and props from a bridge's footprint."""
 DEEPEST_M = 7.0
-"""Largest depth of the terrain below the road at the ends of a bridge."""
+"""No bridge is built where the terrain at its ends lies deeper than this below the road."""
 TRIES = 12
 
 
 @dataclass(frozen=True)
 class Bridge:
-    """One bridge: its place, the heading of the road below, its triangles (n, 12) in the world, and
-    the boxes that cast its shadow (m, 2, 3): least and greatest corner of each in the bridge's
-    frame."""
+    """One bridge over the road at `s` (m). `place` (3,) m and `heading` (rad) give its frame in the
+    world. `triangles` (n, 12) are world vertices in the layout of `solids`. `boxes` (m, 2, 3) cast
+    the shadow: least and greatest corner of each box in the bridge's frame. `half_along` and
+    `half_across` are the half sides (m) of the footprint."""
 
     s: float
     place: FloatArray
@@ -42,15 +43,15 @@ class Bridge:
     half_across: float
 
     def inside(self, points: FloatArray) -> FloatArray:
-        """World points (..., 3) converted to the bridge's own frame."""
+        """Convert world points (..., 3) to the bridge's frame."""
         return self.turned(points - self.place)
 
     def turned(self, direction: FloatArray) -> FloatArray:
-        """World directions (..., 3) converted to the bridge's own frame."""
+        """Rotate world directions (..., 3) into the bridge's frame."""
         return np.asarray(direction @ _turn(self.heading))
 
     def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
-        """Mask of the points x, y (m, world) that lie within `margin_m` of the bridge's
+        """Return a mask of the points x, y (m, world) that lie within `margin_m` of the bridge's
         footprint."""
         own = self.inside(np.stack([x, y, np.zeros_like(x)], axis=-1))
         along, across = np.abs(own[..., 0]), np.abs(own[..., 1])
@@ -58,7 +59,8 @@ class Bridge:
 
 
 def _turn(heading: float) -> FloatArray:
-    """Rotation (3, 3): turn @ column maps a bridge's frame to the world, row @ turn the reverse."""
+    """Return the rotation matrix T (3, 3) of a bridge: T @ column converts directions from the
+    bridge's frame to the world, row @ T converts them back."""
     cos, sin = np.cos(heading), np.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -69,7 +71,7 @@ def free_of(
     y: FloatArray,
     margin_m: float | FloatArray = KEEP_FREE_M,
 ) -> NDArray[np.bool_]:
-    """Mask of the points x, y (m, world) that are farther than `margin_m` from every bridge."""
+    """Return a mask of the points x, y (m, world) farther than `margin_m` from every bridge."""
     free = np.ones(np.shape(x), dtype=np.bool_)
     for bridge in bridges:
         free &= ~bridge.near(x, y, margin_m)
@@ -77,8 +79,8 @@ def free_of(
 
 
 def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridge, ...]:
-    """The bridges of a scene, about one every `theme.bridge_every_m`. No bridge stands on another
-    part of the track."""
+    """Build the bridges of a scene, about one every `theme.bridge_every_m`, sorted by s. A bridge
+    is left out where it would touch another part of the track."""
     if not theme.bridges:
         return ()
     length = ground.road.track.length_m
@@ -100,8 +102,9 @@ def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridg
 
 
 def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
-    """Whether all bridge parts lower than HEADROOM_M lie outside the wall lines of every part of
-    the track. In a bend, an embankment can reach inside them."""
+    """Return whether all parts of a bridge lower than HEADROOM_M above the road height `z` lie
+    outside the wall lines of every part of the track. In a bend, an embankment can reach inside
+    them. `points` (n, 3): corners of its triangles, world, m."""
     corners = points.reshape(-1, 3, 3)
     edges = (corners + np.roll(corners, 1, axis=1)) / 2.0
     every = np.concatenate([points, edges.reshape(-1, 3)])
@@ -110,7 +113,7 @@ def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
 
 
 def _built(ground: Ground, s: float, style: str, rng: np.random.Generator) -> Bridge | None:
-    """A bridge of `style` over the road at `s` (m), or None where there is no room for it."""
+    """Build a bridge of `style` over the road at `s` (m); None if there is no room for it."""
     road = ground.road
     reach = bridge_styles.half_span(style, road.wall_offset)
     across = np.linspace(road.wall_offset + 1.0, reach + 4.0, 8)

@@ -1,7 +1,8 @@
-"""How bridges are built: decks, piers, railings, arches and gantries, in the bridge's own frame.
+"""Builds the triangles of bridges: decks, piers, railings, arches and gantries.
 
-x along the road, y to the left, z up from the road's centre, metres. Each style
-builds into a `BridgeBuilder`, which holds the dimensions of the site.
+The frame is the bridge's own: x along the road, y to the left, z up from the road's centre, metres.
+Each style is a function that adds parts to a `BridgeBuilder`, which holds the dimensions of the
+site.
 """
 
 from collections.abc import Callable
@@ -26,14 +27,15 @@ ROAD_SIGNS: tuple[Point, ...] = ((0.02, 0.10, 0.34), (0.02, 0.17, 0.08))
 NO_COLOUR: Point = (0.0, 0.0, 0.0)
 SPAN_BEYOND_M = {"overpass": 13.0, "railway": 5.0, "footbridge": 3.0, "wooden": 3.0,
                  "adverts": 3.0, "arch": 5.0, "gantry": 1.4}  # fmt: skip
-"""Distance by which a bridge of each style extends beyond the wall line."""
+"""Distance (m) by which a bridge of each style extends beyond the wall line."""
 
 
 class BridgeBuilder:
-    """Gathers the triangles of a bridge and the boxes that cast its shadow.
+    """Collects the triangles of a bridge and the boxes that cast its shadow.
 
-    `wall` is the lateral offset of the wall line, `under` the least height of the underside of the
-    deck and `ground` the lowest terrain at its ends; metres, from the centre of the road.
+    `wall` is the lateral offset of the wall line, `under` the least height of the deck's underside
+    and `ground` the height of the lowest terrain at the bridge's ends: metres from the centre of
+    the road.
     """
 
     def __init__(self, wall: float, under: float, ground: float) -> None:
@@ -42,24 +44,24 @@ class BridgeBuilder:
         self._boxes: list[FloatArray] = []
 
     def box(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
-        """Add a closed box of `size` that stands on `at`, the middle of its floor, and its
-        shadow."""
+        """Add a closed box of `size` (x, y, z), and its shadow. `at` is the middle of the box's
+        floor."""
         self.box_without_shadow(size, at, colour, material)
         self.shadow_box(size, at)
 
     def box_without_shadow(
         self, size: Point, at: Point, colour: Point, material: float = PLAIN
     ) -> None:
-        """Add a closed box that is too thin to cast a visible shadow."""
+        """Add a closed box that casts no shadow, for parts too thin for a visible one."""
         self._parts.append(box(size, at, colour, material, floor=True))
 
     def shadow_box(self, size: Point, at: Point) -> None:
-        """Add a box that casts a shadow but is not drawn."""
+        """Add a box that casts a shadow but is not drawn; `size` and `at` as in `box`."""
         half = np.array([size[0] / 2, size[1] / 2, 0.0])
         self._boxes.append(np.array([at - half, at + half + np.array([0.0, 0.0, size[2]])]))
 
     def face(self, corners: list[FloatArray], colour: Point, material: float) -> None:
-        """Add a face with four corners, counter-clockwise seen from outside. Its texture
+        """Add a face with four corners (3,), counter-clockwise seen from outside. Its texture
         coordinates are metres from the first corner."""
         right = corners[1] - corners[0]
         along = right / max(float(np.linalg.norm(right)), 1e-9)
@@ -71,8 +73,8 @@ class BridgeBuilder:
         self._parts.append(face(corners, uv, colour, material))
 
     def board(self, size: tuple[float, float], at: Point, colour: Point, facing: float) -> None:
-        """Add a lettered board (width, height) across the road with its lower edge at `at`.
-        `facing` is 1 for traffic along +x, -1 for traffic along -x."""
+        """Add a lettered board of `size` (width, height) across the road, with the middle of its
+        lower edge at `at`. `facing` is 1 for traffic along +x, -1 for traffic along -x."""
         wide, high = size
         left, up = np.array([0.0, facing * wide / 2, 0.0]), np.array([0.0, 0.0, high])
         front = np.array(at) - np.array([0.045 * facing, 0.0, 0.0])
@@ -83,20 +85,20 @@ class BridgeBuilder:
         self._parts.append(face(corners, letters, colour, BOARD))
 
     def triangles(self) -> FloatArray:
-        """All triangles, (n, 12)."""
+        """Return all triangles as vertices (n, 12) in the layout of `solids`."""
         return np.concatenate(self._parts)
 
     def boxes(self) -> FloatArray:
-        """Least and greatest corners of the boxes that cast a shadow, (m, 2, 3)."""
+        """Return the least and greatest corners of the boxes that cast a shadow, (m, 2, 3)."""
         return np.array(self._boxes).reshape(-1, 2, 3)
 
 
 Style = Callable[[BridgeBuilder, np.random.Generator], None]
-"""Builds one bridge."""
+"""A function that adds the parts of one bridge to the builder."""
 
 
 def half_span(style: str, wall: float) -> float:
-    """Half of a bridge's length across the road, without its earthworks."""
+    """Return half of a bridge's length (m) across the road, without its embankments."""
     return wall + SPAN_BEYOND_M[style]
 
 
@@ -107,7 +109,7 @@ def _pick(rng: np.random.Generator, colours: tuple[Point, ...]) -> Point:
 def _railing(
     builder: BridgeBuilder, x: float, reach: float, foot: float, colour: Point, step: float
 ) -> None:
-    """Posts and two bars across the road at `x`."""
+    """Add posts, `step` m apart, and two bars across the road at `x`, from -`reach` to `reach`."""
     for height in (0.5, 1.02):
         builder.box_without_shadow((0.06, 2 * reach, 0.06), (x, 0.0, foot + height), colour)
     for y in np.arange(-reach, reach + 0.01, step):
@@ -115,7 +117,7 @@ def _railing(
 
 
 def _mounds(builder: BridgeBuilder, width: float, reach: float, top: float, ground: float) -> None:
-    """Embankments up to both ends of a deck."""
+    """Add the embankments that lead to both ends of a deck."""
     low, spread = ground - 1.0, 1.4 * (top - ground)
     for side in (-1.0, 1.0):
         crest = _ring(width / 2 + 0.3, side * (reach - 0.6), side * (reach + 5.0), top)
@@ -136,7 +138,7 @@ def _ring(x: float, y0: float, y1: float, z: float) -> list[FloatArray]:
 
 
 def overpass(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """A road of concrete on rows of columns."""
+    """Build a concrete road on rows of columns."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, depth = float(rng.uniform(7.0, 9.0)), 1.1
     reach, colour = half_span("overpass", wall), _pick(rng, CONCRETE)
@@ -154,7 +156,7 @@ def overpass(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def railway(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Steel plate girders on abutments of masonry."""
+    """Build a railway bridge: steel plate girders on abutments of masonry."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach = 5.0, half_span("railway", wall)
     steel, stone = _pick(rng, STEEL), _pick(rng, STONE)
@@ -171,17 +173,17 @@ def railway(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def footbridge(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """A narrow steel deck with stairs down both sides."""
+    """Build a narrow steel footbridge with stairs on both sides."""
     _walkway(builder, "footbridge", _pick(rng, STEEL))
 
 
 def wooden(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """A footbridge of timber."""
+    """Build a wooden footbridge."""
     _walkway(builder, "wooden", WOOD)
 
 
 def adverts(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """A footbridge behind a board along its whole length, as race tracks have."""
+    """Build a footbridge with advertising boards along its whole length, as on race tracks."""
     wall, under = builder.wall, builder.under
     _walkway(builder, "adverts", (0.30, 0.30, 0.31))
     reach, colour = half_span("adverts", wall), _pick(rng, ADVERTS)
@@ -207,7 +209,7 @@ def _walkway(builder: BridgeBuilder, style: str, colour: Point) -> None:
 
 
 def _stairs(builder: BridgeBuilder, y: float, top: float, ground: float, colour: Point) -> None:
-    """A flight down along the road, from the deck's edge."""
+    """Add stairs that descend along the road from the deck's edge at lateral offset `y`."""
     steps = max(4, round((top - ground) / 0.5))
     for k in range(steps):
         z = top - (k + 1) * (top - ground) / steps
@@ -222,7 +224,7 @@ def _stairs(builder: BridgeBuilder, y: float, top: float, ground: float, colour:
 
 
 def gantry(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Two posts and a beam with direction signs over the lanes."""
+    """Build two posts and a beam with direction signs over the lanes."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     steel, reach = (0.34, 0.35, 0.36), wall + 0.8
     for y in (-reach, reach):
@@ -238,7 +240,7 @@ def gantry(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def arch(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """A segmental arch of masonry under a level parapet."""
+    """Build a segmental arch of masonry under a level parapet."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach, parts = float(rng.uniform(4.0, 6.0)), half_span("arch", wall), 20
     colour = _pick(rng, STONE)

@@ -1,1 +1,1 @@
-"""The camera, its projection, and the OpenGL context, meshes and render targets it uses."""
+"""The camera, its projection, and its OpenGL context, meshes and render targets."""

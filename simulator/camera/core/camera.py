@@ -1,4 +1,4 @@
-"""The camera: renders a road and the cars on it from a pose. World frame, metres, radians."""
+"""The camera, which renders a road and its cars. World frame, metres, radians."""
 
 import math
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ MAX_SIZE = 4096
 DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
 PARKED_REACH_M = 110.0
-"""Parked cars farther away than this are not drawn."""
+"""Distance from the camera beyond which parked cars are not drawn."""
 HEADLIGHT_AT = (2.1, 0.0, 0.4)
-"""Position that stands for both headlights, in the body frame, metres."""
+"""Position of one light source that replaces both headlights, in the body frame, metres."""
 
 
 def check_size(width: int, height: int) -> None:
-    """Raises UserError unless pictures of this size can be drawn."""
+    """Raises UserError unless pictures of `width` x `height` pixels can be drawn."""
     if not (8 <= width <= MAX_SIZE and 8 <= height <= MAX_SIZE):
         raise UserError(
             f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} pixels"
@@ -48,7 +48,7 @@ def check_size(width: int, height: int) -> None:
 
 @dataclass(frozen=True)
 class _LoadedScene:
-    """One scene under one light in graphics memory; `frame` is its uniform block."""
+    """One scene under one light in graphics memory; `frame` (56,) is its uniform block `Frame`."""
 
     light: Light
     scene: Scene
@@ -58,12 +58,12 @@ class _LoadedScene:
     first_paint: int
     cars: Cars
     imaging: Imaging | None
-    """None: the rendered picture is recorded unchanged."""
+    """None records the rendered picture unchanged."""
 
 
 @dataclass(frozen=True)
 class _Shot:
-    """One view: the eye, the visible part of the scene, and the visible cars, nearest first."""
+    """The content of one picture: eye, visible scene, visible cars (n, 6) nearest first."""
 
     eye: optics.Eye
     seen: VisibleScene
@@ -72,14 +72,14 @@ class _Shot:
 
 
 class Camera:
-    """Draws one scene: `road` with the scenery of `seed` under `light`. `look` is the look of a
-    varied road, None for the paper's roads.
+    """A camera on a car that draws one scene: `road` with the scenery of `seed` under `light`.
+    `look` is the look of a varied road, None for the paper's roads.
 
-    It keeps the last `scenes` scenes in graphics memory. Cameras of a process share one OpenGL
-    context (see `context`); any thread may use them, and they draw one after the other. The same
-    road, seed, light, pose and cars give the same bytes on the same renderer.
-    Raises UserError for a picture size out of range, NoRendererError without EGL, and
-    ForkedRendererError in a process that was forked from one with a camera.
+    It keeps the last `scenes` scenes in graphics memory. All cameras of a process share one OpenGL
+    context (see `context`). Any thread may use them; they draw one after the other. The same road,
+    seed, light, pose and cars give the same bytes on the same renderer. Raises UserError for a
+    picture size out of range, NoRendererError without EGL, and ForkedRendererError in a process
+    that was forked from a process with a camera.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Camera:
         return self._loaded.light
 
     def change_scene(self, seed: int, light: Light, look: RoadLook | None = None) -> None:
-        """Switch to the scenery of `seed` under `light`, on the same road with another `look`."""
+        """Switch to the scenery of `seed` under `light`, with another `look` of the same road."""
         with self._graphics.turns:
             self._current = None
             found = self._cache.pop((seed, light, look), None)
@@ -123,7 +123,7 @@ class Camera:
                     del self._cache[next(iter(self._cache))]
                 self._graphics.free_unused()
                 found = self._load_scene(seed, light, look)
-            # Least recently used first: that one is released next.
+            # The least recently used scene comes first and is released next.
             self._cache[seed, light, look] = self._current = found
 
     def _load_scene(self, seed: int, light: Light, look: RoadLook | None) -> _LoadedScene:
@@ -136,7 +136,7 @@ class Camera:
         return _LoadedScene(
             light,
             scene,
-            # Rendered with the light of the frame that is bound.
+            # The sky is rendered with the light of the bound uniform block `Frame`.
             Sky(graphics, light.weather, float(self._drawn_intrinsics[0, 0])),
             Precipitation(graphics, light, seed) if light.falling > 0.0 else None,
             frame,
@@ -149,10 +149,10 @@ class Camera:
     def render(
         self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
     ) -> Picture:
-        """The picture (height, width, 3) uint8 RGB of `view` from a car at `body_pose`.
+        """Draw `view` from a car at `body_pose`; returns (height, width, 3) uint8 RGB.
 
-        `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity; `others` (n, 6) are
-        the poses of other cars, with z at the ground below each car.
+        `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity (m, rad). `others`
+        (n, 6) are the poses of other cars, with z on the ground below each car.
         """
         return self._views(body_pose, others, {view: ViewRequest(view)})[view]
 
@@ -164,15 +164,15 @@ class Camera:
         *,
         near_s: float | None = None,
     ) -> dict[str, Picture]:
-        """Pictures of several views from one pose, by the names in `views`.
+        """Draw several views from one pose; returns the pictures by the names in `views`.
 
-        "front" (any of VIEWS) is the colour picture (height, width, 3) uint8; "front:depth" the
-        distance along the optical axis (height, width) float32 in metres, inf in the sky;
+        "front" (or another of VIEWS) is the colour picture (height, width, 3) uint8, "front:depth"
+        the distance along the optical axis (height, width) float32 in metres, inf in the sky, and
         "front:class" the index into CLASSES (height, width) uint8. Depth and class belong to the
         surface at the pixel's centre; leaves and hedges count where they are more than half opaque.
-        All kinds of one view share one culling pass. `near_s`: approximate position (m) of the car
-        along the road, which distinguishes a bridge from the road below it; None: the position of
-        the last picture. Raises UserError for an unknown view or kind.
+        `near_s` is the car's approximate position (m) along the road, to distinguish a bridge from
+        the road below it; None uses the position of the last picture. Raises UserError for an
+        unknown view or kind.
         """
         if near_s is not None:
             self._last_s = near_s
@@ -200,7 +200,7 @@ class Camera:
         return {name: taken[each] for name, each in wanted.items()}
 
     def _prepare(self, body_pose: ArrayLike, others: ArrayLike | None, view: str) -> _Shot:
-        """Fill the uniforms of a view, and cull the parts of the scene that it does not show."""
+        """Fill the uniforms for a view, and cull the parts of the scene outside it."""
         loaded = self._loaded
         eye = optics.eye_of(self.parameters, body_pose, view)
         self._set_headlights(loaded.frame, np.asarray(body_pose, dtype=np.float64), eye)
@@ -228,14 +228,14 @@ class Camera:
         return drawn if self._lens is None else self._lens.colours(drawn)
 
     def _recorded(self, picture: NDArray[np.uint8], shot: _Shot, view: str) -> NDArray[np.uint8]:
-        """`picture` after lens, cabin and sensor for the driver view; unchanged for other views."""
+        """Apply lens, cabin and sensor effects to a driver view; return other views unchanged."""
         imaging = self._loaded.imaging
         if imaging is None or view != "front":
             return picture
         return imaging.developed(picture, shot.eye, self._s_of(*shot.eye.place[:2].tolist()))
 
     def _draw_labels(self, shot: _Shot) -> NDArray[np.float32]:
-        """Depth and class (height, width, 2) of the scene without rain and snow."""
+        """Draw depth and class (height, width, 2) of the scene without rain and snow."""
         target = self._graphics.targets.of(self._drawn.width, self._drawn.height, labels=True)
         self._graphics.begin(target, labels=True)
         self._loaded.cars.draw(shot.cars, shot.paints, shot.eye.place, labels=True)
@@ -244,26 +244,27 @@ class Camera:
         return drawn if self._lens is None else self._lens.labels(drawn)
 
     def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
-        """Body frame to camera frame (4, 4): x right, y down, z ahead (the optical axis), metres.
+        """Return the matrix E (4, 4) from the body frame to the camera frame: x right, y down, z
+        ahead, m.
 
-        The matrix is constant for views mounted on the car. `chase` and `top` stay level, so their
-        matrices depend on the roll and pitch of `body_pose`. With `intrinsics` K, K @ (E @
-        point)[:3] is (u, v, 1) times the depth, before a lens's distortion. Raises UserError for an
-        unknown view.
+        E is constant for views mounted on the car. The views `chase` and `top` stay level, so their
+        matrices depend on the roll and pitch of `body_pose`. With the matrix K of `intrinsics`, K @
+        (E @ point)[:3] is (u, v, 1) times the depth, before lens distortion. Raises UserError for
+        an unknown view.
         """
         return optics.extrinsics(self.parameters, body_pose, view)
 
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[FloatArray, FloatArray]:
-        """Pixels (N, 2) (u right, v down) and depth (N,) m of world points; pixels are NaN behind
-        the eye and outside the lens."""
+        """Project world points (N, 3) m: returns pixels (N, 2) (u right, v down) and depth (N,) m.
+        Pixels are NaN for points behind the eye and outside the lens's field of view."""
         eye = optics.eye_of(self.parameters, body_pose, view)
         return optics.project(eye, self.parameters, points)
 
     def close(self) -> None:
-        """Free the graphics memory; while another thread draws, that thread frees it afterwards.
-        A closed camera cannot render."""
+        """Free the graphics memory, now or when the thread that is drawing has finished. A closed
+        camera cannot render."""
         self._cache, self._current = {}, None
         self._graphics.turns.free_if_idle()
 
@@ -274,20 +275,20 @@ class Camera:
         self.close()
 
     def shadow_fraction(self, body_pose: ArrayLike) -> float:
-        """Share (0 to 1) of the road within 30 m ahead of the car that lies in hard shadow."""
+        """Return the share (0 to 1) in hard shadow of the road within 30 m ahead of the car."""
         pose = np.asarray(body_pose, dtype=np.float64)
         s = self._s_of(float(pose[0]), float(pose[1]))
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
 
     def _s_of(self, x: float, y: float) -> float:
-        """Distance s (m) along the road of the point (x, y)."""
+        """Return the distance s (m) along the road of the point (x, y) (m, world)."""
         self._last_s, _ = self.road.track.project(x, y, self._last_s)
         return self._last_s
 
     def _cars_in_view(
         self, body_pose: ArrayLike, others: ArrayLike | None, view: str
     ) -> tuple[FloatArray, list[int]]:
-        """Poses (n, 6) on the ground of the cars to draw, and the paint index of each."""
+        """Return poses (n, 6), on the ground, and paint indices of the cars to draw."""
         poses = np.asarray(() if others is None else others, dtype=np.float64).reshape(-1, 6)
         first = self._loaded.first_paint
         paints = [first + k for k in range(len(poses))]
@@ -312,13 +313,13 @@ class Camera:
     def _set_headlights(
         self, block: NDArray[np.float32], body_pose: FloatArray, eye: optics.Eye
     ) -> None:
-        """Fill the rows of the uniform block `Frame` that hold the positions of the headlights."""
+        """Write position and direction of the headlights into `block`, the block `Frame`."""
         turn = optics.rotation(*body_pose[3:].tolist())
         block[48:51] = body_pose[:3] + turn @ np.array(HEADLIGHT_AT) - eye.place
         block[52:55] = turn[:, 0]
 
     def _set_frame(self, block: NDArray[np.float32], eye: optics.Eye) -> None:
-        """Fill `block`, the uniform block `Frame` of frame.glsl."""
+        """Write the eye's projection into `block`, the uniform block `Frame`, and bind it."""
         drawn = self._drawn
         clip = optics.clip_matrix(eye, self._drawn_intrinsics, drawn.width, drawn.height)
         block[:16] = clip.T.reshape(-1)
@@ -328,15 +329,15 @@ class Camera:
 
 
 def open_camera(road: Road, parameters: CameraParameters, *, light: str, seed: int) -> Camera:
-    """A camera by the name of a light; `seed` draws the scenery, the light's parameters and, on a
-    varied road, the look."""
+    """Make a camera for a kind of light. `seed` determines the scenery, the parameters of the light
+    and, on a varied road, the look."""
     drawn = Light.named(light, np.random.default_rng([seed, 2]))
     look = RoadLook.drawn(seed) if road.carriageway else None
     return Camera(road, parameters, seed=seed, light=drawn, look=look)
 
 
 def _light_rows(light: Light) -> list[tuple[float, ...]]:
-    """The rows of the uniform block `Frame` that describe light and air."""
+    """Return the rows (4 floats each) of the uniform block `Frame` that describe light and air."""
     return [
         (*light.sun_direction, light.shade),
         (*light.sun, light.exposure),

@@ -1,9 +1,10 @@
-"""The one OpenGL context of a process: EGL without a window, on a GPU or on Mesa's llvmpipe.
+"""Creates the single OpenGL context of a process: EGL without a window, on a GPU or on llvmpipe.
 
-Any thread can draw; only one thread draws at a time (see `turns`).
+Every thread may draw, but only one thread draws at a time (see `turns`).
 
-On llvmpipe the environment variable LP_NUM_THREADS, read by Mesa when the context is made, sets the
-drawing threads: 0 draws in the calling thread, which suits one worker process per core.
+llvmpipe is Mesa's software renderer. When the context is created, it reads its number of drawing
+threads from the environment variable LP_NUM_THREADS. With 0 it draws in the calling thread, which
+suits one worker process per core.
 """
 
 import atexit
@@ -43,16 +44,16 @@ PROGRAMS = (
 )
 FRAME_BINDING, SCENE_BINDING, LOOK_BINDING = 0, 1, 2
 VERTEX_SHADERS = {"paved": "road", "verge": "road"}
-"""Programs that use another program's vertex shader, and the name of that program."""
+"""Programs that use the vertex shader of another program, and the name of that program."""
 LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
-"""Functions for fragment shaders."""
+"""Shader files with functions that fragment shaders call."""
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING, "Look": LOOK_BINDING}
 VARIED = "varied"
-"""Feature of the programs for varied roads, which read the uniform block `Look` of look.glsl."""
+"""Feature of the programs for varied roads; they read the uniform block `Look` of look.glsl."""
 NIGHT = "night"
-"""Feature of the programs for night scenes, which are lit by night.glsl."""
+"""Feature of the programs for night scenes; they include the lighting of night.glsl."""
 VARIED_LIBRARIES = ("paint.glsl", "surface.glsl")
-"""Functions for the fragment shaders of varied roads."""
+"""Shader files with functions that only the fragment shaders of varied roads call."""
 WEATHER_PROGRAMS = ("sky", "land", "paved", "verge", "barrier", "prop", "tree")
 """Programs with variants for rain and snow; dry scenes use the faster variant without them."""
 FRAME_FLOATS = 56
@@ -63,13 +64,14 @@ UNITS = {"noise": NOISE_UNIT, "shade": SHADOW_UNIT, "atlas": ATLAS_UNIT, "panora
 
 
 class NoRendererError(UserError):
-    """OpenGL through EGL is not available on this machine."""
+    """Raised if OpenGL through EGL is not available on this machine."""
 
 
 class Graphics:
-    """Context, programs and textures that every camera of the process shares.
+    """The context, programs and textures that all cameras of the process share.
 
-    Use everything except `turns` only inside a `with` block of `turns`."""
+    Everything except `turns` may only be used inside a `with` block of `turns`.
+    """
 
     def __init__(self) -> None:
         self.context, self.turns = _create_context()
@@ -88,7 +90,7 @@ class Graphics:
         self.targets = Targets(self.context, samples)
 
     def begin(self, target: Target, labels: bool = False) -> None:
-        """Clear `target` and make it the one that is drawn to."""
+        """Clear `target`, bind it for drawing, and bind the shared textures."""
         target.clear(labels)
         self.context.enable_only(self.context.DEPTH_TEST)
         self.use_textures()
@@ -99,12 +101,12 @@ class Graphics:
         self.atlas.use(ATLAS_UNIT)
 
     def blend(self) -> None:
-        """Turn on alpha blending for what is drawn from here on."""
+        """Enable alpha blending for all later draw calls."""
         self.context.enable(self.context.BLEND)
         self.context.blend_func = (self.context.SRC_ALPHA, self.context.ONE_MINUS_SRC_ALPHA)
 
     def uniform(self, program: str, name: str) -> "moderngl.Uniform":
-        """A plain uniform of one of the programs."""
+        """Return a uniform of a program in `programs`. Raises TypeError if it is none."""
         import moderngl
 
         member = self.programs[program][name]
@@ -113,8 +115,9 @@ class Graphics:
         return member
 
     def weather_program(self, name: str, weather: str, *features: str) -> str:
-        """Key in `programs` of the variant of program `name` for `weather` ("" when dry) and for
-        `features`, which the shaders test by #ifdef ("sea": the land has a shore)."""
+        """Return the key in `programs` of the variant of program `name` for `weather` ("" when dry)
+        and `features`; compile it on first use. The shaders test the features by #ifdef, such as
+        "sea" for land with a shore."""
         defines = [*features, *([weather] if weather and name in WEATHER_PROGRAMS else [])]
         key = " ".join([name, *defines])
         if key not in self.programs:
@@ -122,7 +125,8 @@ class Graphics:
         return key
 
     def label_program(self, name: str) -> str:
-        """Key in `programs` of the program that draws depth and class in place of `name`."""
+        """Return the key in `programs` of the program that draws depth and class of the geometry of
+        program `name`; compile it on first use."""
         program, *features = name.split()
         kept = [VARIED] if VARIED in features else []
         key = " ".join([program, *kept, "labels"])
@@ -159,7 +163,7 @@ class Graphics:
         return program
 
     def texture(self, texels: NDArray[np.uint8]) -> "moderngl.Texture":
-        """A texture with mipmaps of `texels`, (rows, columns, components) or (rows, columns)."""
+        """Create a texture with mipmaps from `texels`, (rows, columns[, components])."""
         components = texels.shape[2] if texels.ndim == 3 else 1
         texture = self.context.texture(texels.shape[1::-1], components, texels.tobytes())
         texture.build_mipmaps()
@@ -168,21 +172,22 @@ class Graphics:
         return texture
 
     def free_unused(self) -> None:
-        """Free the graphics memory of all objects that nothing refers to any more."""
+        """Free the graphics memory of all objects that have no references any more."""
         self.context.gc()
 
 
 _shared: dict[int, Graphics] = {}
 _begun: set[int] = set()
-"""Ids of the processes that have made a context: this one, and those that it was forked from."""
+"""Ids of this process and of the processes it was forked from that have created a context."""
 _making = [threading.Lock()]
 
 
 def graphics() -> Graphics:
-    """This process's graphics, made on first use.
+    """Return the graphics of this process, created at the first call.
 
-    Raises NoRendererError without EGL, ForkedRendererError in a process that was forked from one
-    with graphics: Mesa's drawing threads do not exist there, so drawing would never return.
+    Raises NoRendererError without EGL, and ForkedRendererError in a process that was forked from
+    one with graphics: Mesa's drawing threads do not exist in a forked process, so drawing would
+    never return.
     """
     process = os.getpid()
     if process not in _shared:
@@ -206,7 +211,7 @@ def _make(process: int) -> None:
 
 
 def _renew_lock() -> None:
-    """Replace the lock in a forked child: a thread of the parent may have held it."""
+    """Replace the lock in a forked child, because a thread of the parent may have held it."""
     _making[0] = threading.Lock()
 
 
@@ -218,7 +223,7 @@ def _source(name: str) -> str:
 
 
 def _create_context() -> "tuple[moderngl.Context, Turns]":
-    """A new context and its turns; the context that is current in this thread stays current."""
+    """Create a context and its turns; the context that was current here becomes current again."""
     import moderngl
 
     settings: dict[str, Any] = {"backend": "egl"}
@@ -243,9 +248,9 @@ def _create_context() -> "tuple[moderngl.Context, Turns]":
 def _load_triton_first() -> None:
     """Load triton's library before Mesa's, if triton is installed (about 30 ms, no import).
 
-    Mesa makes the symbols of its libLLVM global. A libtriton (of torch) that is loaded later binds
-    to them and crashes at import; loaded first, it keeps its own. A process that draws can then
-    use torch at any time.
+    Mesa makes the symbols of its libLLVM global. If libtriton (part of torch's dependencies) is
+    loaded later, it binds to these symbols and crashes at import; if it is loaded first, it uses
+    its own. A process that draws can then import torch at any time.
     """
     if "triton" in sys.modules:
         return
@@ -257,7 +262,7 @@ def _load_triton_first() -> None:
 
 
 def noise_tile() -> NDArray[np.uint8]:
-    """Tileable RGBA noise (256, 256, 4): grain, fine patches, broad patches, crack lines."""
+    """Return tileable RGBA noise (256, 256, 4): grain, fine patches, broad patches, crack lines."""
     rng = np.random.default_rng(20240607)
     grain = _levelled(_filtered(rng, 0.35))
     fine = _levelled(_filtered(rng, 1.15))
@@ -268,7 +273,7 @@ def noise_tile() -> NDArray[np.uint8]:
 
 
 def _filtered(rng: np.random.Generator, power: float) -> NDArray[np.float64]:
-    """Noise whose amplitude falls with frequency to `power`; periodic, so it tiles."""
+    """Return periodic noise whose amplitude is proportional to 1 / frequency^power."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(NOISE_SIZE), np.fft.fftfreq(NOISE_SIZE)))
     frequency[0, 0] = 1.0
     weight = (frequency * NOISE_SIZE) ** -power
@@ -278,7 +283,7 @@ def _filtered(rng: np.random.Generator, power: float) -> NDArray[np.float64]:
 
 
 def _levelled(field: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rank of each value, scaled to [0, 1]."""
+    """Replace each value by its rank, scaled to 0 to 1."""
     rank = np.empty(field.size)
     rank[np.argsort(field, axis=None, kind="stable")] = np.linspace(0.0, 1.0, field.size)
     return rank.reshape(field.shape)

@@ -1,4 +1,4 @@
-"""Frustum culling: bounding spheres against the side planes of a view, in compiled code."""
+"""Frustum culling in compiled code: tests bounding spheres against the side planes of a view."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,14 @@ def visible_runs(
     planes: FloatArray,
     runs: NDArray[np.int64],
 ) -> int:
-    """Fill `runs` (at least N, 2) with first index and number of indices; returns how many runs.
+    """Write the visible runs of indices into `runs` (at least N, 2) as first index and number of
+    indices; returns the number of runs.
 
-    Chunk k lies in the sphere `spheres[k]` (centre, radius). Its levels of detail are rows of
-    `first` and `count` (levels, N). The first level whose reach exceeds the distance to the
-    sphere's near end is drawn. Chunks that end before `nearest` are left out; adjacent chunks are
-    merged into one run.
+    Chunk k lies in the sphere `spheres[k]` (centre, radius; m, world). `eye` (3,) is the viewpoint,
+    `planes` (4, 3) are the inward normals of the side planes. `first` and `count` (levels, N) are
+    the chunks' runs at each level of detail; the first level whose reach exceeds the distance to
+    the sphere's near end is drawn. Chunks that end before `nearest` (m) are left out; adjacent
+    chunks are merged into one run.
     """
     found, end = 0, -1
     for k in range(len(spheres)):
@@ -57,7 +59,8 @@ def visible_spheres(
     eye: FloatArray,
     planes: FloatArray,
 ) -> NDArray[np.int64]:
-    """Indices, nearest first, of at most `most` spheres in the frustum within `reach`."""
+    """Return the indices, nearest first, of at most `most` spheres that are in the frustum and
+    whose centres are within `reach` m of the eye."""
     chosen = np.empty(len(centres), dtype=np.int64)
     distance = np.empty(len(centres))
     found = 0

@@ -1,6 +1,6 @@
-"""Renders a lens with distortion: a pinhole view that covers the lens is drawn, then each pixel of
-the picture is looked up in that view. In pixels; pixel centres have whole coordinates.
-"""
+"""Renders the picture of a lens with distortion: draws a pinhole view that covers the lens's field
+of view, then looks up each pixel of the picture in it. Pixel coordinates; centres of pixels are
+whole."""
 
 from dataclasses import dataclass, replace
 from math import ceil, cos, radians
@@ -15,20 +15,21 @@ from simulator.camera.core.render_modes import CLASSES
 from trackfeatures.camera import CameraParameters
 
 MAX_ANGLE_DEG = 72.0
-"""Largest angle from the optical axis that one pinhole view covers; the picture is black beyond."""
+"""Largest angle from the optical axis that one pinhole view covers; the rest is black."""
 SHARPNESS = 1.5
-"""Pixels of the drawn view per picture pixel, along a line, where the lens enlarges most."""
-SAMPLES = 2  # looked up along each side of a pixel and averaged: a lens shrinks parts of the view
+"""Drawn pixels per pixel of the picture, in each direction, where the lens magnifies most."""
+SAMPLES = 2  # points per pixel and direction, averaged, because a lens shrinks parts of the view
 MARGIN_PX = 2.0
-_OUTSIDE = -1e4  # px; outside every view
+_OUTSIDE = -1e4  # px; lies outside every view
 
 Picture = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class LensView:
-    """The pinhole view to draw for a camera with distortion, and the position in it of each of the
-    camera's pixels: (2, SAMPLES H, SAMPLES W) for colours, (2, H, W) for depth and class, px."""
+    """The pinhole view `drawn` for a camera with distortion, and the position (u, v) px in it of
+    each pixel of the camera, (2, SAMPLES H, SAMPLES W) for colours and (2, H, W) for depth and
+    class."""
 
     drawn: CameraParameters
     colour_places: NDArray[np.float32]
@@ -36,7 +37,7 @@ class LensView:
 
     @classmethod
     def of(cls, camera: CameraParameters, max_size: int) -> Self:
-        """Build the view, at most `max_size` px a side."""
+        """Build the pinhole view for `camera`; its sides have at most `max_size` px."""
         rays, fine = (_seen(camera.rays(_grid(camera, samples))) for samples in (1, SAMPLES))
         drawn = _cover(camera, fine, max_size)
         k = drawn.intrinsics()
@@ -48,7 +49,7 @@ class LensView:
         return cls(drawn, *places)
 
     def colours(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The lens's picture (H, W, 3) from the drawn view `picture`."""
+        """Return the picture of the lens (H, W, 3) from the drawn pinhole view `picture`."""
         u, v = self.colour_places
         found = cv2.remap(picture, u, v, cv2.INTER_LINEAR)
         height, width = self.label_places.shape[1:]
@@ -57,7 +58,8 @@ class LensView:
         )
 
     def labels(self, labels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth and class (H, W, 2) from the drawn view; infinity and sky outside the lens."""
+        """Return depth and class (H, W, 2) seen through the lens from the drawn pinhole view
+        `labels`; outside the lens's field of view they are infinity and sky."""
         u, v = self.label_places
         found = cv2.remap(
             labels,
@@ -71,7 +73,7 @@ class LensView:
 
 
 def _grid(camera: CameraParameters, samples: int) -> FloatArray:
-    """Pixel coordinates (N, 2) of `samples` x `samples` points in each pixel, row by row."""
+    """Return pixel coordinates (N, 2) of `samples` x `samples` points in each pixel, row by row."""
     columns, rows = (
         (np.arange(size * samples) + 0.5) / samples - 0.5 for size in (camera.width, camera.height)
     )
@@ -79,14 +81,14 @@ def _grid(camera: CameraParameters, samples: int) -> FloatArray:
 
 
 def _seen(rays: FloatArray) -> FloatArray:
-    """`rays` (N, 3) with z = 1, NaN beyond `MAX_ANGLE_DEG`."""
+    """Return `rays` (N, 3) with z = 1; rays beyond `MAX_ANGLE_DEG` from the axis become NaN."""
     limit = 1.0 / cos(radians(MAX_ANGLE_DEG))
     return np.where(np.linalg.norm(rays, axis=1, keepdims=True) <= limit, rays, np.nan)
 
 
 def _cover(camera: CameraParameters, rays: FloatArray, max_size: int) -> CameraParameters:
-    """The camera without distortion that covers `rays`, the rays of `_grid(camera, SAMPLES)`, at
-    the resolution of the lens or finer."""
+    """Return a camera without distortion that covers `rays`, the rays of `_grid(camera, SAMPLES)`,
+    at the resolution of the lens or finer, with sides of at most `max_size` px."""
     low, high = np.nanmin(rays[:, :2], axis=0), np.nanmax(rays[:, :2], axis=0)
     flat = rays[:, :2].reshape(camera.height * SAMPLES, camera.width * SAMPLES, 2)
     steps = [np.linalg.norm(np.diff(flat, axis=axis), axis=-1) for axis in (0, 1)]

@@ -1,4 +1,4 @@
-"""Triangle meshes in graphics memory, drawn by chunks that pass frustum culling."""
+"""Triangle meshes in graphics memory; each frame draws the chunks that pass frustum culling."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles ready to draw: `vertices` (N, F) float32, `indices` uint32, chunks to cull by."""
+    """A triangle mesh: `vertices` (N, F) float32, `indices` uint32 and the chunks for culling."""
 
     vertices: NDArray[np.float32]
     indices: NDArray[np.uint32]
@@ -26,9 +26,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Chunks:
-    """Runs of indices that are culled together, by the spheres round their bounding boxes. `low`,
-    `high` (N, 3): corners of the boxes. `first`, `count` (levels, N): first index and number of
-    indices at each level of detail, finest first. Level k is drawn up to `reaches[k]` m."""
+    """Parts of a mesh that are culled as a whole, by the spheres round their bounding boxes. `low`,
+    `high` (N, 3): corners of the boxes, m. `first`, `count` (levels, N): first index and number of
+    indices per level of detail, finest first; level k is drawn up to `reaches[k]` m."""
 
     low: FloatArray
     high: FloatArray
@@ -36,12 +36,12 @@ class Chunks:
     count: NDArray[np.int64]
     reaches: tuple[float, ...]
     nearest: float = 0.0
-    """m; chunks that lie wholly nearer than this are not drawn, since a finer mesh covers them."""
+    """Chunks that lie completely nearer than this (m) are not drawn: a finer mesh covers them."""
 
 
 class Mesh:
-    """One indexed vertex array and its chunks, the parts that culling draws or skips. `layout` is
-    the vertex format and the attribute names, as moderngl takes them."""
+    """An indexed vertex array in graphics memory and its chunks. `layout` is moderngl's vertex
+    format, followed by the names of the attributes."""
 
     def __init__(
         self,
@@ -61,13 +61,14 @@ class Mesh:
         self._runs = np.empty((len(self._spheres), 2), dtype=np.int64)
 
     def visible(self, eye: FloatArray, planes: FloatArray) -> list[list[int]]:
-        """Frustum culling: the (first, count) runs of indices visible from `eye` (3,)."""
+        """Return the runs (first index, count) of indices that are visible from `eye` (3,) within
+        the side planes `planes` (4, 3)."""
         found = visible_runs(self._spheres, *self._levels, eye, planes, self._runs)
         runs: list[list[int]] = self._runs[:found].tolist()
         return runs
 
     def draw(self, runs: list[list[int]], labels: bool) -> None:
-        """Draw the visible runs, as depth and class (`labels`) or in colour."""
+        """Draw the visible runs: depth and class if `labels`, else colours."""
         array = self._arrays[labels]
         for first, count in runs:
             array.render(vertices=count, first=first)
@@ -80,8 +81,8 @@ def vertex_arrays(
     indices: "moderngl.Buffer | None",
     layout: Sequence[str],
 ) -> "tuple[moderngl.VertexArray, moderngl.VertexArray]":
-    """Two vertex arrays over the same vertices: the first draws colours, the second depth and
-    class. Vertex attributes that a program does not use are skipped."""
+    """Create two vertex arrays over the same vertices: the first draws colours, the second depth
+    and class. Vertex attributes that a program does not use are skipped."""
     drawn, labelled = (
         graphics.context.vertex_array(
             graphics.programs[name],

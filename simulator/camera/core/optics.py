@@ -1,9 +1,9 @@
 """Camera views and the pinhole projection.
 
-Body frame: x ahead, y to the left, z up, origin at the centre of gravity; a body pose is
-(x, y, z, roll, pitch, yaw) as PyBullet's Euler angles (R = Rz Ry Rx, pitch positive nose down).
-Image frame: pixels, u to the right, v down; a pixel's centre has whole coordinates. Pictures are
-drawn by a pinhole; `lens_view` adds a lens's distortion.
+Body frame: x ahead, y to the left, z up, origin at the centre of gravity, metres. A body pose is
+(x, y, z, roll, pitch, yaw) with PyBullet's Euler angles in rad (R = Rz Ry Rx, pitch positive nose
+down). Image frame: pixels, u to the right, v down; the centre of a pixel has whole coordinates.
+`lens_view` adds the distortion of a lens to the pinhole pictures.
 """
 
 import math
@@ -19,7 +19,8 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 VIEWS: tuple[str, ...] = ("front", "left", "right", "rear", "chase", "top")
-"""`front` is the driver view; `chase` looks from behind and above, `top` straight down."""
+"""Names of the views. `front` is the driver view, `chase` looks at the car from behind and above,
+and `top` looks straight down."""
 
 NEAR_M = 0.12
 FAR_M = 6000.0
@@ -31,7 +32,8 @@ _TOP_UP_M = 24.0
 
 @dataclass(frozen=True)
 class Eye:
-    """A camera pose in the world: `place` (3,) m and `axes` (3, 3), rows right, up and ahead."""
+    """A camera pose in the world: position `place` (3,) m and `axes` (3, 3), whose rows are the
+    unit vectors to the right, up and ahead."""
 
     place: FloatArray
     axes: FloatArray
@@ -39,7 +41,7 @@ class Eye:
 
 @compiled
 def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """Body-to-world rotation (3, 3), as PyBullet's getMatrixFromQuaternion gives it."""
+    """Return the rotation (3, 3) from body to world, as PyBullet's getMatrixFromQuaternion does."""
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -53,7 +55,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
 
 
 def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
-    """The eye of `view` on a car at `body_pose`. Raises UserError for an unknown view."""
+    """Return the eye of `view` on a car at `body_pose` (6,). Raises UserError for unknown views."""
     pose = np.asarray(body_pose, dtype=np.float64)
     yaw = float(pose[5])
     if view == "chase":
@@ -81,7 +83,8 @@ def _eye(place: FloatArray, turn: FloatArray) -> Eye:
 
 
 def extrinsics(camera: CameraParameters, body_pose: ArrayLike, view: str) -> FloatArray:
-    """Body frame to camera frame (x right, y down, z ahead) of `view`, (4, 4)."""
+    """Return the matrix (4, 4) from body to camera frame (x right, y down, z ahead, m) of
+    `view`."""
     pose = np.asarray(body_pose, dtype=np.float64)
     eye = eye_of(camera, pose, view)
     right, up, ahead = eye.axes
@@ -93,8 +96,8 @@ def extrinsics(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Flo
 
 
 def project(eye: Eye, camera: CameraParameters, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) and depth (N,) m along the optical axis; pixels are NaN behind the eye and
-    where the lens does not see."""
+    """Project world points (N, 3) m: returns pixels (N, 2) and depth (N,) in m along the optical
+    axis. Pixels are NaN for points behind the eye and outside the lens's field of view."""
     places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     if camera.distortion == "none":
         return _pixels(places, eye.place, eye.axes, camera.intrinsics())
@@ -106,7 +109,8 @@ def project(eye: Eye, camera: CameraParameters, points: ArrayLike) -> tuple[Floa
 def _pixels(
     points: FloatArray, eye: FloatArray, axes: FloatArray, matrix: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`project` as a compiled loop, which costs less than numpy's calls for a frame's markings."""
+    """Project without distortion in a compiled loop, faster than numpy for a few hundred points.
+    `axes` (3, 3) as in `Eye`; `matrix` (3, 3): intrinsics."""
     pixels, depth = np.empty((len(points), 2)), np.empty(len(points))
     for k in range(len(points)):
         x, y, z = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
@@ -123,14 +127,15 @@ def _pixels(
 
 
 def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
-    """From eye-relative world coordinates to clip space (4, 4), row vectors last.
+    """Return the matrix (4, 4) from world coordinates relative to the eye to clip space; multiply
+    it by column vectors.
 
-    The image is flipped against OpenGL's convention: its first row in memory is the top one.
+    The image is flipped against OpenGL's convention: the first row in memory is the top row.
     """
     x_scale = 2.0 * matrix[0, 0] / width
     y_scale = 2.0 * matrix[1, 1] / height
     clip = np.zeros((4, 4))
-    # Offset of the principal point from the picture's middle, in half sides; 0 for a centred one.
+    # Offset of the principal point from the picture's middle, in half sides; 0 if it is centred.
     aside, below = ((2.0 * matrix[k, 2] + 1.0) / (width, height)[k] - 1.0 for k in (0, 1))
     clip[0, :3] = eye.axes[0] * x_scale + eye.axes[2] * aside
     clip[1, :3] = -eye.axes[1] * y_scale + eye.axes[2] * below
@@ -141,7 +146,7 @@ def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatA
 
 
 def frustum(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
-    """Inward unit normals (4, 3) of the side planes through the eye."""
+    """Return the inward unit normals (4, 3) of the side planes, which pass through the eye."""
     left, up = ((matrix[k, 2] + 0.5) / matrix[k, k] for k in (0, 1))
     right, down = width / matrix[0, 0] - left, height / matrix[1, 1] - up
     sides = np.array([[-1.0, 0.0, right], [1.0, 0.0, left], [0.0, -1.0, up], [0.0, 1.0, down]])

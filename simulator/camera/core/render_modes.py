@@ -1,4 +1,4 @@
-"""Kinds of image of a view: colour, or the depth or class of each pixel."""
+"""Kinds of image of a view: colour, depth of each pixel, or class of each pixel."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -10,22 +10,24 @@ from simulator.camera.core.optics import FAR_M, VIEWS
 from trackfeatures.errors import UserError
 
 CLASSES: tuple[str, ...] = ("road", "marking", "car", "ground", "sky", "object")
-"""Classes of a pixel; the index is the class number. `object`: trees, rails, houses, signs and
-all else beside the road; `ground`: kerb, verge, terrain; worn-off paint is `road`."""
+"""Classes of a pixel; the index in this tuple is the class number. `object` is everything beside
+the road that has no other class, such as trees, rails, houses and signs. `ground` is kerb, verge
+and terrain. Worn-off paint is `road`."""
 
 COLOUR, DEPTH, CLASS = PICTURE_KINDS = ("colour", "depth", "class")
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """A requested image: view and kind."""
+    """A requested image: name of the view (one of VIEWS) and kind (one of PICTURE_KINDS)."""
 
     view: str
     kind: str = COLOUR
 
     @classmethod
     def of(cls, name: str) -> Self:
-        """Read "front", "front:depth" or "front:class"; UserError for an unknown view or kind."""
+        """Parse "front", "front:depth" or "front:class". Raises UserError if the name is
+        unknown."""
         view, _, kind = name.partition(":")
         if view not in VIEWS:
             raise UserError(
@@ -40,5 +42,6 @@ class ViewRequest:
 
 
 def bounded(picture: NDArray[Any]) -> NDArray[Any]:
-    """`picture`; in a depth image the depth of the sky is changed from infinity to FAR_M."""
+    """Replace infinite depth (the sky) by FAR_M, in place, if `picture` is a depth image (float32);
+    other images are returned unchanged."""
     return np.minimum(picture, FAR_M, out=picture) if picture.dtype == np.float32 else picture

@@ -1,4 +1,4 @@
-"""Framebuffers for colour or for depth and class, and reading them back."""
+"""Framebuffers to draw colours, or depth and class, and functions to read them."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,22 +14,22 @@ if TYPE_CHECKING:
     import moderngl
 
 GPU_SAMPLES = 4
-"""Samples per pixel on a GPU. llvmpipe uses one: four samples took 24 ms a frame instead of 6, and
-the shader filters road and paint anyway."""
+"""Samples per pixel on a GPU. On llvmpipe it is one: four samples took 24 ms a frame instead of 6
+ms, and the shaders antialias road and paint in any case."""
 _KEPT = 16
 _SKY = float(CLASSES.index("sky"))
 
 
 @dataclass(frozen=True)
 class Target:
-    """The framebuffer that a picture is drawn to (multisampled), and the framebuffer that it is
-    resolved to for reading."""
+    """A framebuffer to draw in (multisampled), and the framebuffer that it is resolved to for
+    reading."""
 
     drawn: "moderngl.Framebuffer"
     resolved: "moderngl.Framebuffer"
 
     def clear(self, labels: bool) -> None:
-        """Bind the target and clear it; labels are cleared to sky at infinity."""
+        """Bind and clear the framebuffer. `labels`: clear to depth infinity and class sky."""
         self.drawn.use()
         if labels:
             self.drawn.clear(np.inf, _SKY)
@@ -37,17 +37,17 @@ class Target:
             self.drawn.clear()
 
     def colours(self) -> NDArray[np.uint8]:
-        """The picture drawn (height, width, 3) RGB."""
+        """Return the drawn picture (height, width, 3) uint8 RGB."""
         if self.resolved is not self.drawn:
             self.drawn.ctx.copy_framebuffer(self.resolved, self.drawn)
         width, height = self.resolved.size
         read = np.empty((height, width, 4), np.uint8)
         self.resolved.read_into(read, components=4)
-        # Read with alpha: in Mesa, reading without it takes twice as long.
+        # The alpha channel is read too, because Mesa takes twice as long without it.
         return np.asarray(cv2.cvtColor(read, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
     def labels(self) -> NDArray[np.float32]:
-        """The drawn labels (height, width, 2): depth in metres and number of the class."""
+        """Return the drawn labels (height, width, 2): depth in metres and class number."""
         width, height = self.resolved.size
         read = np.empty((height, width, 2), np.float32)
         self.resolved.read_into(read, components=2, dtype="f4")
@@ -55,14 +55,15 @@ class Target:
 
 
 class Targets:
-    """Cache of a context's targets by size; it keeps a limited number."""
+    """A cache of a context's targets, by size and kind; it keeps at most _KEPT targets."""
 
     def __init__(self, context: "moderngl.Context", samples: int) -> None:
         self._context, self._samples = context, samples
         self._kept: dict[tuple[int, int, bool], Target] = {}
 
     def of(self, width: int, height: int, labels: bool) -> Target:
-        """The target of this size, made on first use. Raises UserError if it cannot be made."""
+        """Return the target of this size, created at first use; `labels` selects depth and class.
+        Raises UserError if it cannot be created."""
         key = (width, height, labels)
         if key not in self._kept:
             if len(self._kept) >= _KEPT:

@@ -1,7 +1,7 @@
-"""Grants threads the process's one OpenGL context, one at a time; a forked child never gets it.
+"""Gives the OpenGL context of the process to one thread at a time, and never to a forked child.
 
-OpenGL acts on the context that is current in the calling thread. Without one its calls silently do
-nothing: the picture would be black, or the previous one.
+OpenGL acts on the context that is current in the calling thread. Without a current context its
+calls do nothing, without an error: the picture would be black, or the previous picture.
 """
 
 import ctypes
@@ -17,14 +17,14 @@ Current = tuple[int | None, int | None, int | None, int | None]
 NOTHING: Final[Current] = (None, None, None, None)
 
 END_S: Final = 5.0
-"""Longest wait (s), at the end of the process, for another thread to finish its picture."""
+"""Longest time (s) that the end of the process waits for another thread to finish its picture."""
 _DRAW, _READ = 0x3059, 0x305A
 _LIBRARY: Final = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or "libEGL.so.1"
-"""The library that moderngl's backend loads."""
+"""The EGL library that moderngl's backend loads."""
 
 
 class ForkedRendererError(UserError):
-    """This process was forked from one that had used OpenGL already, so it cannot draw."""
+    """Raised in a process that was forked from one that had used OpenGL; it cannot draw."""
 
 
 FORKED: Final = (
@@ -36,7 +36,7 @@ FORKED: Final = (
 
 
 class ContextError(UserError):
-    """The OpenGL context cannot be made current in this thread."""
+    """Raised if the OpenGL context cannot be made current in this thread."""
 
 
 class Egl:
@@ -54,14 +54,14 @@ class Egl:
         self._make_current.argtypes = [pointer] * 4
 
     def current(self) -> Current:
-        """The display, surfaces and context that are current in this thread."""
+        """Return the display, surfaces and context that are current in this thread."""
         context = self._context()
         if context is None:
             return NOTHING
         return self._display(), self._surface(_DRAW), self._surface(_READ), context
 
     def give_back(self, own: Current, before: Current) -> None:
-        """Make `before` current again in place of `own`; no context, if none was current before."""
+        """Make `before` current again in place of `own`, or no context if `before` is NOTHING."""
         self.make_current(before if before is not NOTHING else (own[0], None, None, None))
 
     def make_current(self, wanted: Current) -> None:
@@ -75,10 +75,12 @@ class Egl:
 
 
 class Turns:
-    """A `with` block makes the context current in its thread; other threads wait for its end.
+    """A `with` block makes the context current in its thread; other threads wait until the block
+    ends.
 
-    Blocks may be nested. At the end of the outermost, `free` is called, and the context that was
-    current before is restored, since other libraries rely on it. A block costs 0.03 ms on llvmpipe.
+    Blocks may be nested. At the end of the outermost block, `free` is called and the context that
+    was current before is restored, because other libraries rely on it. A block costs 0.03 ms on
+    llvmpipe.
     """
 
     def __init__(self, egl: Egl, own: Current, free: Callable[[], object]) -> None:
@@ -110,8 +112,8 @@ class Turns:
             self._lock.release()
 
     def free_if_idle(self) -> None:
-        """Call `free` now, or at the end of the open block. It never waits, so the garbage
-        collector can call it in any thread; in a forked child it does nothing."""
+        """Call `free` now, or leave it to the end of the open block. The method never waits, so the
+        garbage collector can call it in any thread; in a forked child it does nothing."""
         if not self._inherited and self._lock.acquire(blocking=False):
             try:
                 if self._depth == 0:
