@@ -1,4 +1,4 @@
-"""Projects the true lane markings into an image and draws them. Pixels."""
+"""Projects the true lane markings into an image and draws them. Coordinates are in pixels."""
 
 from typing import TYPE_CHECKING, Protocol
 
@@ -21,7 +21,7 @@ _COLOUR = (255, 0, 200)
 
 
 class Projector(Protocol):
-    """The part of `Camera` that an overlay needs."""
+    """The part of `Camera` that the overlay uses."""
 
     width: int
     height: int
@@ -29,7 +29,7 @@ class Projector(Protocol):
     def project(
         self, points: ArrayLike, body_pose: ArrayLike, view: str = "front"
     ) -> tuple[FloatArray, FloatArray]:
-        """Pixels and depth of world points."""
+        """Return pixels (N, 2) and depth (N,) m of world points (N, 3) m."""
 
 
 def marking_polylines(
@@ -39,15 +39,15 @@ def marking_polylines(
     ahead_m: float = 60.0,
     view: str = "front",
 ) -> list[FloatArray]:
-    """Pixel polylines (n, 2) of the centres of the true markings, leftmost first; for a double
-    line, of the line nearer to the car's lane.
+    """Return pixel polylines (n, 2) along the centres of the true markings, leftmost first. Of a
+    double line, the polyline follows the line nearer to the car's lane.
 
-    `at` is (s, body pose) of the car, or its state. Each line runs from just behind the eye to
-    `ahead_m`; points behind the camera or far outside the image are cut off. Occlusion by hills is
-    ignored.
+    `at` is (s, body pose) of the car, or its state. Each polyline begins just behind the eye and
+    ends at `ahead_m`; points behind the camera or far outside the image are removed. Occlusion by
+    hills is ignored.
     """
     s, body_pose = at if isinstance(at, tuple) else (at.s, pose_of_state(at))
-    # Backward views look at the road behind the car.
+    # The rear view shows the road behind the car.
     start, end = (-ahead_m, BEHIND_M) if view == "rear" else (-BEHIND_M, ahead_m)
     if view in ("top", "left", "right"):
         start = -ahead_m
@@ -63,7 +63,7 @@ def marking_polylines(
 
 
 def pose_of_state(state: "CarState") -> FloatArray:
-    """Body pose (6,) of a car's state."""
+    """Return the body pose (6,) of a car's state: x, y, z (m), roll, pitch, yaw (rad)."""
     return np.array([state.x, state.y, state.z, state.roll, state.pitch, state.yaw])
 
 
@@ -72,7 +72,7 @@ def draw(
     polylines: list[FloatArray],
     colour: tuple[int, int, int] = _COLOUR,
 ) -> NDArray[np.uint8]:
-    """A copy of `image` (H, W, 3) with thin antialiased lines over it."""
+    """Return a copy of `image` (H, W, 3) with the polylines drawn thin and antialiased."""
     drawn = image.copy()
     # cv2 takes integer coordinates in 1/16 pixel.
     fixed = [np.rint(line * 16.0).astype(np.int32) for line in polylines]
@@ -81,7 +81,7 @@ def draw(
 
 
 def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
-    """Mask of the points that lie in front of the camera and not far outside the image."""
+    """Return a mask (N,) of the points in front of the camera and not far outside the image."""
     margin = 0.5 * max(camera.width, camera.height)
     u, v = pixels[:, 0], pixels[:, 1]
     return np.asarray(
@@ -92,8 +92,8 @@ def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> N
 
 
 def _runs(lines: FloatArray, good: NDArray[np.bool_]) -> list[FloatArray]:
-    """Runs (n, 2) of at least two consecutive `good` (L, N) points of `lines` (L, N, 2)."""
-    # A column of False on either side separates the lines and gives every run a start and an end.
+    """Split `lines` (L, N, 2) into runs (n, 2) of at least two consecutive `good` (L, N) points."""
+    # Columns of False on both sides separate the lines and give each run a start and an end.
     padded = np.zeros((good.shape[0], good.shape[1] + 2), dtype=np.bool_)
     padded[:, 1:-1] = good
     flat = padded.ravel()

@@ -1,6 +1,6 @@
-"""A contact sheet of a road: driver views along it with the true markings drawn over them.
+"""Writes a contact sheet of a road: driver views along it, with the true markings drawn over them.
 
-simulator snapshot TRACK --out sheet.png --view chase --kind class --light rain
+|simulator snapshot TRACK --out sheet.png --view chase --kind class --light rain
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
     "object": (232, 156, 30),
 }
 NEAREST_M, FARTHEST_M = 2.0, 500.0
-"""Depths of the first and the last colour of the logarithmic scale."""
+"""Depths of the first and the last colour of the logarithmic depth scale."""
 _NO_DEPTH = (12, 12, 16)
 
 
@@ -67,18 +67,19 @@ def write_contact_sheet(
 ) -> None:
     """Write a PNG of views at points all round `road`.
 
-    All pictures show `view`; without it, driver views, one chase view and one top view. All are in
-    the light of kind `light`; without it, every other picture is in clear light and the rest cycle
-    through the other kinds. With `kind` "colour" the right half has the true markings drawn thinly
-    over the painted ones; "depth" and "class" are in false colours. `camera` is the lens, scaled to
-    WIDTH; without it, the driver camera, on a varied road at the random height of that road. On a
-    varied road each light has a look of its own. An older file is kept until the new one is
-    complete. Raises UserError if the file is not a PNG, its folder does not exist, or light, view
-    or kind is unknown; OSError if it cannot be written.
+    All pictures show `view`; without it the sheet has driver views, one chase view and one top
+    view. All are in the light `light`; without it every second picture is in clear light and the
+    rest cycle through the other kinds. With `kind` "colour" the right half of each picture has the
+    true markings drawn thinly over the painted ones; "depth" and "class" are in false colours.
+    `camera` is the lens, scaled to WIDTH; without it, the driver camera is used, on a varied road
+    at the random camera height of that road. On a varied road each light has its own look. An
+    existing file is replaced only when the new one is complete. Raises UserError if `out` is not a
+    PNG file, its folder does not exist, or light, view or kind is unknown, and OSError if the file
+    cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
-    check_folder(out)  # before rendering, which takes a while
+    check_folder(out)  # checked before rendering, which takes several seconds
     if light is not None:
         check_light(light)
     ViewRequest.of(f"{view or 'front'}:{kind}")
@@ -105,8 +106,8 @@ def write_contact_sheet(
 
 
 def _lens(road: Road, camera: CameraParameters | None) -> CameraParameters:
-    """The camera of a sheet: `camera` scaled to WIDTH, or else the driver camera, on a varied road
-    at the random height of that road."""
+    """Return the camera of a sheet: `camera` scaled to WIDTH or, if it is None, the driver camera,
+    on a varied road at the random camera height of that road."""
     if camera is not None:
         return camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
     lens = CameraParameters(WIDTH, HEIGHT)
@@ -118,7 +119,7 @@ def _lens(road: Road, camera: CameraParameters | None) -> CameraParameters:
 def render_shot(
     camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator
 ) -> Picture:
-    """The picture of `shot` with a caption; in colour with the true markings on its right half."""
+    """Draw `shot` with a caption; a colour picture shows the true markings on its right half."""
     pose = standing_pose(road, shot.s, shot.to_middle, shot.angle)
     cars = _cars_ahead(road, shot, traffic, rng)
     name = f"{shot.view}:{shot.kind}"
@@ -145,7 +146,7 @@ def _write_legend(picture: Picture, kind: str) -> None:
 
 
 def _write(picture: Picture, text: str, place: tuple[int, int], colour: Colour) -> int:
-    """Write `text` with a shadow and return its width in pixels."""
+    """Write `text` with a shadow at `place` (x, y) px; returns its width in px."""
     for shade, shift in (((0, 0, 0), 1), (colour, 0)):
         at = (place[0] + shift, place[1] + shift)
         cv2.putText(picture, text, at, _FONT, _FONT_SIZE, shade, 1, cv2.LINE_AA)
@@ -159,7 +160,8 @@ def standing_pose(
     angle: float = 0.0,
     height: float = CarParameters.cg_height,
 ) -> FloatArray:
-    """Pose (6,) of a car that stands on the road plane, `height` m above it along its normal."""
+    """Return the pose (6,) of a car at `s`, `to_middle` (m) and `angle` (rad) on the road plane;
+    its origin is `height` m above the plane, along the plane's normal."""
     track = road.track
     place = track.at(s, to_middle)
     here = np.array([place.x, place.y, place.z], dtype=np.float64)
@@ -196,7 +198,7 @@ def _shots(road: Road, light: str | None, rng: np.random.Generator) -> list[Shot
 
 
 def _cars_ahead(road: Road, shot: Shot, count: int, rng: np.random.Generator) -> FloatArray:
-    """Poses (count, 6) of cars standing in lanes ahead, none within 12 m of another."""
+    """Return poses (count, 6) of random cars in lanes ahead, at least 12 m apart."""
     ahead = np.cumsum(rng.uniform(*CAR_GAP_M, count))
     lanes = rng.integers(0, road.lanes, count)
     first = (road.lanes - 1) * road.lane_width / 2
@@ -208,8 +210,8 @@ def _cars_ahead(road: Road, shot: Shot, count: int, rng: np.random.Generator) ->
 
 
 def colourise(picture: NDArray[np.generic], kind: str) -> Picture:
-    """`picture` of `kind` "depth" (red near, blue far, black sky) or "class" (CLASS_COLOURS) in
-    false colours; a picture of kind "colour" is returned unchanged."""
+    """Return `picture` of `kind` "depth" (red near, blue far, black sky) or "class" (CLASS_COLOURS)
+    in false colours; a picture of kind "colour" is returned unchanged."""
     if kind == DEPTH:
         return _depth_colours(np.asarray(picture, dtype=np.float64))
     if kind == CLASS:

@@ -1,1 +1,1 @@
-"""What lies between the scene and the recorded picture: windscreen, bonnet, lens and sensor."""
+"""Effects between scene and recorded picture: windscreen, bonnet, lens and sensor."""

@@ -1,5 +1,5 @@
-"""Effects of bonnet, windscreen dirt, reflections and vignette that stay constant in a scene, as a
-gain and an addition to each pixel's linear light."""
+"""Effects of bonnet, windscreen dirt, reflections and vignette. They are constant in a scene, and
+stored as a gain and an addition to the linear light of each pixel."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from simulator.camera.scene.light import Light
 from simulator.varied.look import Cabin, RoadLook
 
 REFERENCE_WIDTH = 280.0
-"""Picture width (pixels) for which blurs and sizes are stated."""
+"""Picture width (px) for which blur radii and sizes in this package are stated."""
 PAINTS = (
     (0.02, 0.02, 0.022), (0.34, 0.34, 0.33), (0.11, 0.115, 0.12), (0.16, 0.015, 0.012),
     (0.012, 0.03, 0.09), (0.09, 0.04, 0.03), (0.05, 0.052, 0.055), (0.02, 0.05, 0.035),
@@ -22,14 +22,15 @@ DASHBOARD = (0.012, 0.012, 0.013)
 
 @dataclass(frozen=True)
 class Glass:
-    """Linear light (1 is the brightest displayed) becomes light * `gain` + `add`, (H, W, 3)."""
+    """Effects of the cabin: linear light (1 is the brightest displayed value) becomes light *
+    `gain` + `add`; both are (H, W, 3)."""
 
     gain: NDArray[np.float32]
     add: NDArray[np.float32]
 
 
 def glass_of(look: RoadLook, light: Light, width: int, height: int) -> Glass:
-    """The effects of the cabin and lens of `look` on a `width` x `height` picture in `light`."""
+    """Compute the effects of cabin and lens of `look` in `light` on pictures of this size (px)."""
     cabin, lens = look.cabin, look.lens
     rng = np.random.default_rng([cabin.shape, 1])
     scene = surrounding_light(light, night=look.light.night)
@@ -47,21 +48,22 @@ def glass_of(look: RoadLook, light: Light, width: int, height: int) -> Glass:
 
 
 def surrounding_light(light: Light, night: bool) -> FloatArray:
-    """Linear RGB of a grey surface in the open, as displayed; by night only the sky lights it."""
+    """Return the displayed linear RGB of a grey surface in the open; at night only the sky
+    counts."""
     sun = 0.0 if night else np.array(light.sun) * np.sin(light.sun_elevation)
     return np.asarray(0.5 * light.exposure * (np.array(light.sky) + sun))
 
 
 def vignette(loss: float, width: int, height: int) -> FloatArray:
-    """Share of light (H, W) that arrives: 1 in the middle, 1 - `loss` in the corners."""
+    """Return the share (H, W) of transmitted light: 1 in the middle, 1 - `loss` in the corners."""
     v, u = np.mgrid[0:height, 0:width]
     off = np.hypot(2.0 * u / (width - 1) - 1.0, (2.0 * v / (height - 1) - 1.0) * height / width)
     return np.asarray(1.0 - loss * (off / off.max()) ** 2.4)
 
 
 def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
-    """Number of picture rows (W,) that the bonnet covers in each column, counted from the bottom.
-    The largest number is the share `cabin.bonnet` of the height."""
+    """Return the number of picture rows (W,), from the bottom, that the bonnet covers in each
+    column. The largest number is the share `cabin.bonnet` of the height."""
     rng = np.random.default_rng([cabin.shape, 2])
     x = (np.arange(width) + 0.5) / width * 2.0 - 1.0 - rng.normal(0.0, 0.15)
     drop = rng.uniform(0.05, 0.9) * np.abs(x) ** rng.uniform(1.6, 4.5)
@@ -76,7 +78,7 @@ def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
 def _bonnet(
     cabin: Cabin, light: Light, scene: FloatArray, width: int, height: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Cover (H, W) of the bonnet, 0 to 1, and its colour (H, W, 3) in linear light."""
+    """Return the opacity (H, W) of the bonnet, 0 to 1, and its colour (H, W, 3) in linear light."""
     if cabin.bonnet == 0.0:
         return np.zeros((height, width)), np.zeros((height, width, 3))
     edge = bonnet_edge(cabin, width, height)
@@ -88,7 +90,7 @@ def _bonnet(
     blur = rng.uniform(0.4, 2.0) * width / REFERENCE_WIDTH
     soft = cv2.GaussianBlur(cover, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
     share = np.clip(below / max(cabin.bonnet * height, 1.0), 0.0, 1.0)
-    # Seen at a flat angle, the far end of the bonnet mirrors the sky over the horizon.
+    # At grazing angles the far end of the bonnet reflects the sky over the horizon.
     mirror = (0.0 if dashboard else rng.uniform(0.1, 0.45)) * np.exp(-share * rng.uniform(2.0, 7.0))
     streaks = cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), 9.0, sigmaY=2.0)
     mirror = mirror * (1.0 + 1.5 * streaks / max(float(streaks.std()), 1e-9) * 0.2)
@@ -98,7 +100,7 @@ def _bonnet(
 
 
 def _dirt(width: int, height: int, rng: np.random.Generator) -> FloatArray:
-    """Dirt on the windscreen (H, W), 0 to 1: a film, smears of the wiper, specks."""
+    """Return random dirt on the windscreen (H, W), 0 to 1: a film, smears of the wiper, specks."""
     scale = width / REFERENCE_WIDTH
     film = _field(width, height, 26.0 * scale, 18.0 * scale, rng)
     smear = _field(width, height, 9.0 * scale, 4.0 * scale, rng)
@@ -108,7 +110,7 @@ def _dirt(width: int, height: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _reflections(width: int, height: int, rng: np.random.Generator) -> FloatArray:
-    """Reflections of the dashboard in the windscreen (H, W), 0 to 1, mostly in its lower part."""
+    """Return random reflections of the dashboard in the windscreen (H, W), 0 to 1."""
     layer = np.zeros((height, width), dtype=np.float32)
     for _ in range(rng.integers(2, 7)):
         middle = rng.uniform([-0.1, 0.35], [1.1, 1.1]) * (width, height)
@@ -128,7 +130,7 @@ def _reflections(width: int, height: int, rng: np.random.Generator) -> FloatArra
 def _field(
     width: int, height: int, sigma_u: float, sigma_v: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Smooth noise (H, W) with standard deviation 1."""
+    """Return smooth noise (H, W) with standard deviation 1; the sigmas of the blur are in px."""
     noise = rng.standard_normal((height, width)).astype(np.float32)
     field = cv2.GaussianBlur(noise, (0, 0), sigma_u, sigmaY=sigma_v)
     return np.asarray(field / max(float(field.std()), 1e-9), dtype=np.float64)

@@ -1,6 +1,6 @@
-"""The pass over a rendered picture that applies motion blur, glass, glare, sensor noise and tone.
+"""Applies motion blur, glass, glare, sensor noise and a tone curve to a rendered picture.
 
-The rendered picture holds square roots of linear light, 0 to 255. Each pixel becomes
+The rendered picture contains square roots of linear light, 0 to 255. Each pixel becomes
 tone(sqrt((mean of light over the exposure * gain + add + glare) * exposure) + noise).
 """
 
@@ -20,7 +20,7 @@ Plane = NDArray[np.float32]
 
 
 def noise_table() -> NDArray[np.int8]:
-    """Normal noise (NOISE_SIZE,) in units of 1 / NOISE_STEPS standard deviations."""
+    """Return normal noise (NOISE_SIZE,) int8, in units of 1 / NOISE_STEPS standard deviations."""
     rng = np.random.default_rng(20261126)
     drawn = np.rint(rng.standard_normal(NOISE_SIZE) * NOISE_STEPS)
     return np.clip(drawn, -127, 127).astype(np.int8)
@@ -38,14 +38,14 @@ def develop(
     normal: NDArray[np.int8],
     contrast: float,
 ) -> Picture:
-    """The developed picture (H, W, 3) of `picture` (H, W, 3).
+    """Return `picture` (H, W, 3) with all effects applied, (H, W, 3).
 
     `gain` and `add` (H, W, 3) and the factor `exposure` apply to linear light, where 1 is the
-    brightest displayed value. `motion`: u, v of the point the car drives to; height of the camera
-    times focal length (m px); distance driven during the exposure (m). `glare`: u, v of the sun,
-    and strength. `noise`: standard deviation in display values of 0 to 255, and this picture's
-    seed. `normal`: see `noise_table`. The tone curve is an S through 0, 0.5 and 1 of the display's
-    range, with the slope 1 + `contrast` in the middle.
+    brightest displayed value. `motion`: u, v (px) of the point that the car drives to, height of
+    the camera times focal length (m px), distance driven during the exposure (m). `glare`: u, v
+    (px) of the sun, and strength. `noise`: standard deviation in display values of 0 to 255, and
+    the seed of this picture. `normal`: table from `noise_table`. The tone curve is an S through 0,
+    0.5 and 1 of the display's range; its slope in the middle is 1 + `contrast`.
     """
     height, width = picture.shape[0], picture.shape[1]
     out = np.empty_like(picture)
@@ -74,10 +74,10 @@ def develop(
 def _exposed_row(
     picture: Picture, v: int, motion: tuple[float, float, float, float], light: Plane
 ) -> None:
-    """Linear light (3 W,) of row `v`, the mean over the exposure.
+    """Write the linear light (3 W,) of row `v`, averaged over the exposure, into `light`.
 
-    A pixel below the horizon is treated as a point of a flat road, which moves away from the point
-    the car drives to. Pixels above the horizon do not move.
+    Pixels below the horizon are treated as points of a flat road, which move away from the point
+    that the car drives to. Pixels above the horizon do not move.
     """
     height, width = picture.shape[0], picture.shape[1]
     u0, v0, reach, travel = motion
@@ -85,7 +85,7 @@ def _exposed_row(
     row = picture[v].reshape(3 * width)
     for k in range(3 * width):
         light[k] = np.float32(row[k]) * np.float32(row[k]) * full
-    share = travel * max(v - v0, 0.0) / reach  # distance driven over the distance of the point
+    share = travel * max(v - v0, 0.0) / reach  # distance driven / distance of the road point
     apart = share * max(0.5 * width, v - v0)
     if apart < LEAST_BLUR_PX:
         return
@@ -106,7 +106,7 @@ def _exposed_row(
 
 @compiled
 def _add_glare(light: Plane, v: int, glare: tuple[float, float, float]) -> None:
-    """Add the light that the lens scatters round the sun to row `v`."""
+    """Add the sunlight that the lens scatters round the sun to row `v` of linear light (3 W,)."""
     width = len(light) // 3
     sun_u, sun_v, strength = glare
     narrow, wide = np.float32(0.04 * width) ** 2, np.float32(0.3 * width) ** 2

@@ -1,6 +1,6 @@
-"""Rain drops on the windscreen and the wiper that clears them, in pixels. There is no clock: the
-position along the road determines the position of the wiper and the number of drops that have
-fallen since its last stroke."""
+"""Draws rain drops on the windscreen and the wiper that clears them. Pixels. The camera has no
+clock: the position along the road determines the position of the wiper and the number of drops that
+have fallen since its last stroke."""
 
 import math
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from simulator.varied.look import Cabin
 Picture = NDArray[np.uint8]
 
 STAGES = 3
-"""Number of steps in which drops gather between two strokes of the wiper."""
+"""Number of stages in which drops accumulate between two strokes of the wiper."""
 SMALL = 4
 """Factor by which the picture seen through drops is reduced; drops show it so small that this
-resolution is enough."""
+resolution is sufficient."""
 SWEEP = 0.3
-"""Share of a wiper's period that its stroke takes."""
+"""Duration of the wiper's stroke as a share of its period."""
 MOST_DROPS = 400
 OPACITY = 235
-"""Opacity of a drop, of 255."""
+"""Opacity of a drop, 0 to 255."""
 BLADE = 14
-"""Display value of the wiper, 0 to 255."""
+"""Grey value of the wiper, 0 to 255."""
 VIEW = 0.16
-"""Radius of the view that a drop shows, as a share of the picture's width."""
+"""Radius of the part of the picture that a drop shows, as a share of the picture's width."""
 
 
 @dataclass(frozen=True)
 class _Drops:
-    """The N pixels that drops cover: each pixel's row-major index, the index of the pixel of the
-    small picture that it shows, and the opacity of the drop there (0 to 255)."""
+    """The N pixels that drops cover. `pixel`: row-major index of each pixel; `source`: index of the
+    pixel of the small picture that it shows; `cover`: opacity of the drop there, 0 to 255."""
 
     pixel: NDArray[np.int32]
     source: NDArray[np.int32]
@@ -43,10 +43,10 @@ class _Drops:
 
 
 class Windscreen:
-    """Drops and wiper of one cabin, for pictures of one size."""
+    """The wet windscreen of one cabin: draws drops and wiper into pictures of one size."""
 
     def __init__(self, cabin: Cabin, cover: float, wipes: bool, size: tuple[int, int]) -> None:
-        """`cover`: largest share of the glass that drops cover; `size`: pictures (W, H), px."""
+        """`cover`: largest share of the glass that drops cover; `size`: picture size (W, H), px."""
         self._cabin, self._cover, self._wipes, self._size = cabin, cover, wipes, size
         width, height = size
         rng = np.random.default_rng([cabin.shape, 4])
@@ -55,7 +55,7 @@ class Windscreen:
         self._kept: tuple[tuple[int, int], _Drops] | None = None
 
     def applied(self, picture: Picture, s: float) -> Picture:
-        """`picture` seen through the wet glass at `s` (m) along the road."""
+        """Return `picture` (H, W, 3) seen through the wet glass at `s` (m) along the road."""
         turns, phase = divmod(s / self._period_m, 1.0)
         stroke, stage = (int(turns), int(phase * STAGES)) if self._wipes else (0, STAGES - 1)
         drops = self._drops(stroke, stage)
@@ -66,7 +66,7 @@ class Windscreen:
         return wet
 
     def _wipe(self, picture: Picture, share: float) -> None:
-        """Draw the wiper's blade over `picture`, at `share` (0 to 1) of its stroke and back."""
+        """Draw the wiper's blade over `picture` at `share` (0 to 1) of its way there and back."""
         width, height = self._size
         angle = math.radians(-85.0 + 170.0 * (1.0 - abs(2.0 * share - 1.0)))
         reach = 1.15 * height
@@ -79,7 +79,7 @@ class Windscreen:
         _darken(picture, np.asarray(cv2.blur(mask, (soft, soft)), np.uint8), BLADE)
 
     def _drops(self, stroke: int, stage: int) -> _Drops:
-        """The drops of one stroke at a stage; they include the drops of earlier stages."""
+        """Return the drops at a stage of one stroke, including the drops of earlier stages."""
         if self._kept is None or self._kept[0] != (stroke, stage):
             rng = np.random.default_rng([self._cabin.shape, 5, stroke])
             share = (stage + 1) / STAGES
@@ -88,12 +88,12 @@ class Windscreen:
 
 
 def _small(size: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of the small picture."""
+    """Return width and height of the small picture, px."""
     return -(-size[0] // SMALL), -(-size[1] // SMALL)
 
 
 def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Generator) -> _Drops:
-    """The first `share` of the drops that together cover about the share `cover` of a picture."""
+    """Return the first `share` of random drops that together cover `cover` of a picture."""
     width, height = size
     scale = width / REFERENCE_WIDTH
     radius = np.clip(np.exp(rng.normal(0.7, 0.45, MOST_DROPS)), 1.1, 9.0) * scale
@@ -113,10 +113,11 @@ def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Ge
 def _stamped(
     shape: FloatArray, width: int, height: int, view: float
 ) -> tuple[Picture, NDArray[np.int32]]:
-    """Opacity of the drops (H, W), and for each of their pixels the pixel of the small picture.
+    """Return the opacity (H, W) of the drops, and for each covered pixel the index (H, W) of the
+    pixel of the small picture that it shows.
 
-    `shape` (N, 4): middle and half axes of each drop, px. A drop shows the picture within `view`
-    pixels of its middle, upside down.
+    `shape` (N, 4): middle and half axes of each drop, px. A drop shows the part of the picture
+    within `view` px of its middle, upside down.
     """
     mask = np.zeros((height, width), np.uint8)
     source = np.zeros((height, width), np.int32)
@@ -143,7 +144,7 @@ def _through(
     source: NDArray[np.int32],
     cover: Picture,
 ) -> Picture:
-    """A copy of `picture` with the drops drawn into it; for the arguments see `_Drops`."""
+    """Return a copy of `picture` with the drops drawn into it; for the arguments see `_Drops`."""
     out = picture.copy()
     flat, seen = out.reshape(-1, 3), small.reshape(-1, 3)
     for k in range(len(pixel)):
@@ -156,7 +157,7 @@ def _through(
 
 @compiled
 def _darken(picture: Picture, cover: Picture, value: int) -> None:
-    """Draw the grey `value` over `picture` with the opacity `cover` (H, W), 0 to 255."""
+    """Draw the grey `value` over `picture`, in place, with the opacity `cover` (H, W), 0 to 255."""
     for v in range(picture.shape[0]):
         for u in range(picture.shape[1]):
             weight = np.int32(cover[v, u])

@@ -1,4 +1,4 @@
-"""From the rendered picture to the recorded one: rain on the glass, blur, noise, tone and JPEG."""
+"""Turns the rendered picture into the recorded picture: rain drops, blur, noise, tone and JPEG."""
 
 import math
 from collections.abc import Sequence
@@ -24,18 +24,18 @@ RAIN_DROPS = 0.08
 """Share of the windscreen that drops cover between two strokes of the wiper in rain, for looks
 without drops of their own."""
 DAZZLED = 245
-"""Display value from which a pixel shows the sun itself."""
+"""Display value (0 to 255) from which a pixel is taken as a part of the visible sun."""
 GLOWS = np.uint8(215)
-"""Display value from which a light glows by night."""
+"""Display value (0 to 255) from which a pixel glows at night."""
 GLOW_GAIN = 12.0
 ADAPTING_M = 10.0
-"""Distance driven in which the exposure follows a change of brightness."""
+"""Distance driven while the exposure adapts to a change of brightness by 63 %."""
 DARK_NOISE = 1.8
-"""Factor on the sensor noise by night."""
+"""Factor on the sensor noise at night."""
 
 
 class Imaging:
-    """Cabin, lens and sensor of one look, in one light, for one camera."""
+    """Effects of cabin, lens and sensor on the pictures of one camera, for a look and a light."""
 
     def __init__(
         self, look: RoadLook, light: Light, camera: CameraParameters, bridges: Sequence[Bridge]
@@ -59,8 +59,8 @@ class Imaging:
             )
 
     def developed(self, picture: Picture, eye: Eye, s: float) -> Picture:
-        """The recorded picture (H, W, 3) made from the rendered `picture` (H, W, 3) of `eye`, `s` m
-        along the road."""
+        """Turn the rendered `picture` (H, W, 3) of `eye`, at `s` m along the road, into the
+        recorded picture (H, W, 3)."""
         lens = self._lens
         if self._night:
             picture = _with_glow(picture)
@@ -87,7 +87,7 @@ class Imaging:
         return _compressed(picture, lens.jpeg_quality) if lens.jpeg_quality else picture
 
     def _glare(self, picture: Picture, eye: Eye) -> tuple[float, float, float]:
-        """Position of the sun in the picture and strength of its glare: see `develop`."""
+        """Return position (u, v) px of the sun and strength of its glare for `develop`."""
         right, up, ahead = eye.axes @ np.array(self._light.sun_direction)
         if self._flare == 0.0 or ahead < 0.05 or self._light.shade > 0.5:
             return 0.0, 0.0, 0.0
@@ -105,7 +105,7 @@ class Imaging:
 
 
 def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float, float, float]:
-    """The argument `motion` of `develop` for a car that drives `travel_m` during the exposure."""
+    """Return `develop`'s argument `motion` for a car that drives `travel_m` in the exposure."""
     matrix = camera.intrinsics()
     ahead = optics.extrinsics(camera, np.zeros(6), "front")[:3, 0]
     u, v, _ = matrix @ ahead / ahead[2]
@@ -113,8 +113,8 @@ def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float,
 
 
 def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> float:
-    """Stops by which the exposure has opened at `s`: up to `stops` below a bridge, and back to 0
-    behind it. `decks`: position along the road and half length (m) of each bridge's deck."""
+    """Return the stops by which the exposure is increased at `s` (m): up to `stops` below a bridge,
+    falling to 0 behind it. `decks`: position along the road and half length of each deck (m)."""
     most = 0.0
     for place, half in decks:
         into = min(s - (place - half), 2.0 * half)
@@ -126,13 +126,13 @@ def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> 
 
 
 def _deck(bridge: Bridge) -> tuple[float, float]:
-    """Position along the road and half length (m) of the part of `bridge` above the road."""
+    """Return position along the road and half length (m) of the part of `bridge` over the road."""
     over = bridge.boxes[bridge.boxes[:, 0, 2] > HEADROOM_M]
     return bridge.s, float(np.abs(over[..., 0]).max()) if len(over) else bridge.half_along
 
 
 def _with_glow(picture: Picture) -> Picture:
-    """The picture with a glow round the pixels that are brighter than `GLOWS`."""
+    """Return the picture with a glow round the pixels brighter than `GLOWS`."""
     width, height = picture.shape[1], picture.shape[0]
     bright = np.maximum(picture, GLOWS) - GLOWS
     small = cv2.resize(bright, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
@@ -143,13 +143,13 @@ def _with_glow(picture: Picture) -> Picture:
 
 
 def _seed_of(eye: Eye) -> int:
-    """Seed of a picture's noise: a hash of the camera's position, so no clock is needed."""
+    """Return the seed of a picture's noise, a hash of the camera's position (there is no clock)."""
     x, y, z = (round(float(part) * 1e4) for part in eye.place)
     return ((x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)) % 2**62
 
 
 def _compressed(picture: Picture, quality: int) -> Picture:
-    """The picture after JPEG compression with 4:2:0 colours."""
+    """Return the picture after JPEG compression with 4:2:0 chroma subsampling."""
     bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:

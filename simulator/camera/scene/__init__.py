@@ -1,1 +1,1 @@
-"""Geometry and drawing of the scene: road, terrain, props, barriers, cars, sky, weather."""
+"""Builds and draws the scene: road, terrain, props, barriers, cars, sky and weather."""

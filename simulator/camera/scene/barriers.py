@@ -1,6 +1,7 @@
-"""Rails, walls, hedges and fences along both wall lines of the road, changing by section.
+"""Barriers along both wall lines of the road: rails, walls, hedges and others, which change by
+section.
 
-World frame, metres. Their collision shapes are in `simulator.world.walls`.
+World frame, metres. The collision shapes of the walls are in `simulator.world.walls`.
 """
 
 import numpy as np
@@ -17,11 +18,11 @@ from simulator.varied.look import Roadside
 KINDS: tuple[str, ...] = (
     "rail", "wall", "hedge", "fence", "stones", "tyres", "crops", "bank", "none",
 )  # fmt: skip
-"""Kinds of barriers; barrier.frag.glsl numbers them in this order."""
+"""Kinds of barriers; their order is the numbering in barrier.frag.glsl."""
 HEIGHT_M = np.array([0.8, 0.9, 1.25, 1.05, 0.75, 0.95, 1.1, 0.6, 0.0])
 THICK_M = np.array([0.06, 0.25, 0.9, 0.06, 0.5, 0.7, 3.0, 0.8, 0.0])
 GROWS = np.isin(KINDS, ("wall", "crops", "bank"))
-"""Mask of the kinds whose height a varied road's look scales."""
+"""Mask of the kinds whose height the look of a varied road scales."""
 SECTION_M = (90.0, 420.0)
 LAYOUT = ("3f 2f 1f 3f", "at", "along", "kind", "facing")
 """Layout of a vertex: x, y, z, s, height, kind, normal (3)."""
@@ -31,7 +32,8 @@ LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 
 def build(
     road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator, roadside: Roadside
 ) -> Surface:
-    """Barriers of both sides: of the theme's kinds, or of the single kind that `roadside` names."""
+    """Build the barriers of both sides. Their kinds are the theme's, or on each side the single
+    kind that `roadside` names."""
     grids, profiles = [], []
     heights = np.where(GROWS, roadside.height, 1.0) * HEIGHT_M
     for side, column, only in zip(
@@ -41,9 +43,9 @@ def build(
         kind = _sections(mesh.s, road.track.length_m, kinds, rng)
         grid = _one_side(mesh, road, side, column, (kind, heights[kind]))
         grids.append(grid)
-        # The large weight keeps every row at which the kind changes.
+        # The large weight makes `strip` keep every row at which the kind changes.
         profiles.append(np.column_stack([mesh.points[:, column], 100.0 * kind]))
-    # One strip, the right side after the left; the quads that would join them have no area.
+    # One strip contains both sides; the quads between left and right side have no area.
     left, right = grids
     bridge = np.stack([left[-1], right[0]])
     bridge[:, :, :3] = right[0, 0, :3]
@@ -63,7 +65,7 @@ def build(
 def _sections(
     s: FloatArray, length: float, kinds: tuple[str, ...], rng: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Kind of barrier of each row."""
+    """Return the kind (R,) of barrier at each row of the road mesh, as indices into KINDS."""
     count = int(length / SECTION_M[0]) + 2
     ends = np.cumsum(rng.uniform(*SECTION_M, count))
     choice = rng.choice(np.array([KINDS.index(kind) for kind in kinds]), count)
@@ -77,8 +79,8 @@ def _one_side(
     column: int,
     build: tuple[NDArray[np.intp], FloatArray],
 ) -> NDArray[np.float32]:
-    """Vertices (R, 3, 9): the foot, the upper edge, and the far edge of the top; `build` is the
-    kind and the height (R,)."""
+    """Return the vertices (R, 3, 9) of one side: foot, upper edge, and far edge of the top. `build`
+    is kind (R,) and height (R,) in m; `column` is the wall line's column of the mesh."""
     kind, height = build
     foot = mesh.points[:, column].copy()
     heading = road.track.at(mesh.s).heading

@@ -1,7 +1,7 @@
-"""The cars: one triangle mesh, drawn at each car's pose, and the shadow on the ground below it.
+"""Draws the cars: one triangle mesh at each car's pose, and the shadow on the ground below it.
 
-Car frame: x ahead, y left, z up, metres; origin on the ground below the middle of the car. A vertex
-is a position, a normal and a colour; the colour (-1, -1, -1) stands for the car's paint.
+Car frame: x ahead, y left, z up, metres; the origin is on the ground below the middle of the car. A
+vertex is position, normal and colour; the colour (-1, -1, -1) is replaced by the car's paint.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ REACH_M, NEAR_M = 350.0, 40.0
 SHADOW_REACH_M = 120.0
 _RADIUS_M = 3.0
 _LONGEST_SHADOW = 4.0
-"""Largest length of a shadow, as a multiple of the height."""
+"""Largest length of a shadow, as a multiple of the car's height."""
 
 PAINTS: tuple[Point, ...] = (
     (0.42, 0.025, 0.022), (0.03, 0.07, 0.28), (0.62, 0.62, 0.60), (0.035, 0.036, 0.04),
@@ -36,11 +36,11 @@ _OWN: Point = (-1.0, -1.0, -1.0)
 _GLASS, _RUBBER, _RIM = (0.022, 0.03, 0.038), (0.012, 0.012, 0.013), (0.32, 0.32, 0.33)
 _TAIL, _HEAD, _PLATE, _DARK = (0.5, 0.01, 0.01), (0.85, 0.85, 0.78), (0.7, 0.7, 0.66), (0.02,) * 3
 
-# Side outline of the body and of the cabin: (x, z), and half the width there.
+# Side outlines of body and cabin, from rear to front: x, z and half the width there, in m.
 _BODY = ((-2.2, 0.42, 0.78), (-2.18, 0.92, 0.82), (-1.35, 0.98, 0.9), (0.75, 0.94, 0.9),
          (1.9, 0.74, 0.84), (2.2, 0.55, 0.74), (2.2, 0.3, 0.74))  # fmt: skip
 _CABIN = ((-1.75, 0.95, 0.78), (-1.05, 1.38, 0.62), (0.05, 1.4, 0.62), (0.95, 0.92, 0.78))
-# Lights, number plate and bumpers: x, y and z as (from, to), then the colour.
+# Lights, number plate and bumpers: x, then y from and to, z from and to, in m, and the colour.
 _REAR_X, _FRONT_X = -2.225, 2.225
 _PANELS = (
     (_REAR_X, 0.78, 0.48, 0.66, 0.84, _TAIL), (_FRONT_X, 0.78, 0.48, 0.5, 0.62, _HEAD),
@@ -53,8 +53,8 @@ _WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
 
 @dataclass(frozen=True)
 class CarMesh:
-    """Triangles of a car, (3 T, 9) float32: place, normal, colour. The first `near` vertices are
-    the near level of detail; the vertices from `far` on are the far one, with simpler wheels."""
+    """Triangles of a car, vertices (3 T, 9) float32: position, normal, colour. The first `near`
+    vertices are the near level of detail; the vertices from `far` on are the far level."""
 
     vertices: NDArray[np.float32]
     near: int
@@ -62,7 +62,7 @@ class CarMesh:
 
 
 def car_mesh() -> CarMesh:
-    """The car's triangles in both levels of detail."""
+    """Build the car's triangles in both levels of detail."""
     wheels, far_wheels = (
         [part for x in _WHEELS_X for side in (-1.0, 1.0) for part in wheel(x, side)]
         for wheel in (_wheel, _far_wheel)
@@ -74,13 +74,13 @@ def car_mesh() -> CarMesh:
 
 
 def _face(points: Sequence[Point], colour: Point) -> FloatArray:
-    """Two triangles (6, 9); from the normal's side the four corners run counter-clockwise."""
+    """Return two triangles (6, 9); the four corners are counter-clockwise seen from outside."""
     corners = [np.array(point) for point in points]
     return face(corners, [(0.0, 0.0)] * 4, colour, PLAIN)[:, :9]
 
 
 def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) -> list[FloatArray]:
-    """A prism over an outline (x, z, half width), from rear to front, down to `floor`."""
+    """Build a prism from `outline` (x, z, half width), rear to front, down to z = `floor`."""
     parts = []
     for (x0, z0, w0), (x1, z1, w1) in pairwise(outline):
         parts.append(_face([(x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1)], top))
@@ -98,7 +98,7 @@ def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) ->
 
 
 def _cabin() -> list[FloatArray]:
-    """Glass all round under a painted roof."""
+    """Build the cabin: windows on all sides under a painted roof."""
     parts = []
     for k, (back, front) in enumerate(pairwise(_CABIN)):
         (x0, z0, w0), (x1, z1, w1) = back, front
@@ -118,7 +118,7 @@ def _cabin() -> list[FloatArray]:
 
 
 def _wheel(x: float, side: float) -> list[FloatArray]:
-    """A tyre of eight faces with its rim, standing out of the flank a little."""
+    """Build a wheel at `x`: a tyre with ten faces and a rim, projecting from the flank."""
     parts = []
     outer, inner = side * 0.91, side * 0.68
     angles = np.linspace(0.0, 2.0 * np.pi, 11)
@@ -145,7 +145,7 @@ def _wheel(x: float, side: float) -> list[FloatArray]:
 
 
 def _far_wheel(x: float, side: float) -> list[FloatArray]:
-    """A tyre as one dark face of six corners."""
+    """Build a wheel at `x` as one dark face with six corners."""
     y = side * 0.91
     ring = [
         (x + _WHEEL_RADIUS * np.cos(t), y, _WHEEL_RADIUS * (1.0 + np.sin(t)))
@@ -156,7 +156,7 @@ def _far_wheel(x: float, side: float) -> list[FloatArray]:
 
 
 def _fittings() -> list[FloatArray]:
-    """Lights, number plates and bumpers, 2.5 cm off the body."""
+    """Build lights, number plates and bumpers, 2.5 cm in front of the body."""
     parts = []
     for x, y0, y1, z0, z1, colour in _PANELS:
         corners = [(x, y0, z0), (x, y1, z0), (x, y1, z1), (x, y0, z1)]
@@ -165,7 +165,7 @@ def _fittings() -> list[FloatArray]:
 
 
 class Cars:
-    """The car mesh, shared by all cameras of a process, and its drawing."""
+    """The car mesh in graphics memory and its drawing; all cameras of a process share it."""
 
     def __init__(self, graphics: Graphics, *features: str) -> None:
         context = graphics.context
@@ -189,7 +189,8 @@ class Cars:
         self._patch = context.vertex_array(graphics.programs["spot"], [(patch, "2f", "corner")])
 
     def visible(self, poses: FloatArray, eye: FloatArray, planes: FloatArray) -> NDArray[np.intp]:
-        """Indices of the cars of `poses` (n, 6) in the frustum, nearest first."""
+        """Return the indices of the cars of `poses` (n, 6) in the frustum, nearest first. `eye`
+        (3,) and `planes` (4, 3) as in `frustum_culling`."""
         if len(poses) == 0:
             return np.empty(0, dtype=np.intp)
         relative = poses[:, :3] - eye
@@ -198,7 +199,7 @@ class Cars:
         return np.flatnonzero(inside)[np.argsort(distance[inside], kind="stable")]
 
     def draw(self, poses: FloatArray, paints: list[int], eye: FloatArray, labels: bool) -> None:
-        """Draw the cars at `poses` (n, 6); `paints` are indices into PAINTS."""
+        """Draw the cars at `poses` (n, 6); `paints` are their indices into PAINTS."""
         for pose, paint in zip(poses, paints, strict=True):
             self._stands[labels].write(_model_matrix(pose, eye).tobytes())
             self._paint.value = PAINTS[paint % len(PAINTS)]
@@ -207,7 +208,7 @@ class Cars:
             self._meshes[labels].render(vertices=count, first=first)
 
     def draw_shadows(self, poses: FloatArray, eye: FloatArray, light: Light) -> None:
-        """Draw the shadows on the ground; blending must be on."""
+        """Draw the shadows of the cars on the ground. Blending must be enabled."""
         x, y, z = light.sun_direction
         fall = np.array([-x, -y]) / max(z, 1e-3)
         fall *= min(1.0, _LONGEST_SHADOW / max(float(np.hypot(*fall)), 1e-9))
@@ -224,12 +225,12 @@ class Cars:
 
 @lru_cache(maxsize=2)
 def shared_cars(graphics: Graphics, *features: str) -> Cars:
-    """The cars of this graphics, made on first use; `features` as in `weather_program`."""
+    """Return these graphics' cars, created at first use; `features` as in `weather_program`."""
     return Cars(graphics, *features)
 
 
 def _model_matrix(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:
-    """Car frame to eye-relative world, (4, 4), column-major as OpenGL expects."""
+    """Return the matrix (4, 4) from car frame to eye-relative world, column-major for OpenGL."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation(float(pose[3]), float(pose[4]), float(pose[5]))
     matrix[:3, 3] = pose[:3] - eye

@@ -1,5 +1,5 @@
-"""The terrain grid as triangle meshes, fine near the viewer and coarse up to the horizon, and the
-share of sunlight that trees block from it. World frame, metres."""
+"""Builds triangle meshes of the terrain, fine near the viewer and coarse up to the horizon, and
+computes the share of sunlight that trees block from it. World frame, metres."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from simulator.camera.scene.terrain import CentreLineSamples, Terrain, between
 from simulator.camera.vegetation.scenery import Trees
 
 LAYOUT = ("3f 3f 1f", "at", "facing", "sunlit")
-"""Layout of a vertex: x, y, z, normal (3), share of sunlight."""
+"""Layout of a vertex: x, y, z, normal (3), share of sunlight that arrives."""
 BLOCK = 4
-"""A chunk is BLOCK x BLOCK cells."""
+"""Cells along each side of a chunk."""
 SMOOTH_M = 9.0
 MOST_SHADE = 0.8
 CANOPY, CANOPY_M = 0.55, 30.0
-"""In the heavy-shadow light: shade of the canopy, and its reach from the road."""
+"""In the heavy-shadow light: shade of the canopy, halved at CANOPY_M from the centre line."""
 
 
 @dataclass(frozen=True)
 class TreeShade:
-    """Share of sunlight that trees block from the terrain: `shade` (rows y, columns x) on its grid,
-    0 to MOST_SHADE. It is smoothed, so single shadows are not resolved."""
+    """The share of sunlight that trees block from the terrain: `shade` (rows along y, columns along
+    x) on its grid, 0 to MOST_SHADE. It is smoothed, so single shadows are not resolved."""
 
     terrain: Terrain
     shade: FloatArray
@@ -35,7 +35,7 @@ class TreeShade:
     def of(
         cls, terrain: Terrain, line: CentreLineSamples, trees: Trees, light: Light
     ) -> "TreeShade":
-        """The shade of `trees` under the sun of `light`, zero where it casts no hard shadow."""
+        """Compute the shade of `trees` in `light`; it is zero if the sun casts no hard shadow."""
         shade: FloatArray = np.zeros(terrain.z.shape)
         if light.shade >= 0.5:
             return cls(terrain, shade)
@@ -52,8 +52,8 @@ class TreeShade:
         return cls(terrain, MOST_SHADE * (1.0 - np.exp(-shade / MOST_SHADE)))
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Share of sunlight that trees block at the points x, y (m, world), 0 to MOST_SHADE: the
-        value of the nearest grid point."""
+        """Return the share of sunlight that trees block at the points x, y (m, world), 0 to
+        MOST_SHADE. It is the value of the nearest grid point."""
         i, j, _ = self.terrain.grid.nearest(x, y)
         rows, columns = self.shade.shape
         return np.asarray(self.shade[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)])
@@ -61,8 +61,8 @@ class TreeShade:
 
 @dataclass(frozen=True)
 class Span:
-    """One level of detail of the terrain: cells of `step` x `step` cells of the finest grid, drawn
-    in chunks from `start_m` to `reach_m`. `bare`: drawn also where the road mesh covers it."""
+    """A level of detail of the terrain. Its cells are `step` x `step` cells of the finest grid; it
+    is drawn from `start_m` to `reach_m`. `bare`: cells below the road mesh are drawn too."""
 
     step: int
     start_m: float
@@ -71,7 +71,7 @@ class Span:
 
 
 def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
-    """The terrain at one level of detail, nowhere above the finest one.
+    """Build the terrain at one level of detail; it is nowhere higher than the finest level.
 
     `hidden` (rows, columns) marks the points of the finest grid that the road mesh covers.
     """
@@ -94,8 +94,8 @@ def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
 
 
 def lowered(z: FloatArray, step: int) -> FloatArray:
-    """Every `step`-th height of `z`, lowered by the largest amount by which the coarse triangles
-    rise above the fine heights next to it."""
+    """Return every `step`-th height of `z` in both directions, lowered by the largest amount by
+    which the coarse triangles rise above the fine heights next to it."""
     kept = z[::step, ::step]
     if step == 1:
         return kept
@@ -106,7 +106,7 @@ def lowered(z: FloatArray, step: int) -> FloatArray:
 
 
 def _in_chunks(vertices: NDArray[np.float32], shown: NDArray[np.bool_], span: Span) -> Surface:
-    """Two triangles for each cell that is `shown`, in blocks of BLOCK x BLOCK cells."""
+    """Build two triangles for each cell that is `shown`, in chunks of BLOCK x BLOCK cells."""
     columns = vertices.shape[1]
     j, i = np.nonzero(shown)
     block = (j // BLOCK) * (columns // BLOCK + 1) + i // BLOCK

@@ -1,7 +1,7 @@
 """Light and weather: direction of the sun, brightness of sun and sky, visibility.
 
-Colours are linear RGB; azimuth in rad counter-clockwise from world x, elevation in rad. The values
-of each kind of light are in light.toml.
+Colours are linear RGB. Azimuth is in rad counter-clockwise from world x, elevation in rad.
+light.toml contains the values of each kind of light.
 """
 
 import math
@@ -19,44 +19,45 @@ Colour = tuple[float, float, float]
 
 KINDS: tuple[str, ...] = ("clear", "overcast", "dusk", "fog", "heavy-shadow", "rain", "snow")
 WEATHERS: tuple[str, ...] = ("rain", "snow")
-"""The kinds of light with precipitation; the others are dry."""
+"""The kinds of light with rain or snow; all other kinds are dry."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """One light. `shade`: share of the lit luminance that is left in a hard shadow on the road."""
+    """The light and weather of one scene."""
 
     kind: str
     sun_azimuth: float
     sun_elevation: float
     sun: Colour
-    """Light of the sun on a surface that faces it."""
+    """Light that the sun gives a surface facing it."""
     sky: Colour
-    """Light from above on a level surface."""
+    """Light that the sky gives a horizontal surface."""
     zenith: Colour
     horizon: Colour
     haze: Colour
     haze_per_km: float
-    """Extinction: after 1 km the share exp(-haze_per_km) of a colour is left."""
+    """Extinction: after 1 km the share exp(-haze_per_km) of an object's colour is left."""
     clouds: float
-    """Share of the sky that is cloud, 0 to 1."""
+    """Share of the sky that clouds cover, 0 to 1."""
     shade: float
+    """Share of the lit luminance that is left in a hard shadow on the road, 0 to 1."""
     canopy: bool = False
-    """Whether trees meet over the road and cast dappled shadow on it (kind "heavy-shadow")."""
+    """Whether trees meet over the road and cast dappled shadow on it (only kind "heavy-shadow")."""
     exposure: float = 1.0
     cover: float = 0.0
-    """In rain, how wet the road is; in snow, how much of it is white; 0 to 1."""
+    """Wetness of the road in rain, or share of the road that is white in snow; 0 to 1."""
     falling: float = 0.0
     """Density of rain or snow, 0 to 1."""
 
     @property
     def weather(self) -> str:
-        """One of WEATHERS, or "" when it is dry."""
+        """The kind if it is one of WEATHERS, else ""."""
         return self.kind if self.kind in WEATHERS else ""
 
     @staticmethod
     def named(kind: str, rng: np.random.Generator) -> "Light":
-        """A light of `kind` with random parameters from `rng`. Raises UserError for an unknown
+        """Make a light of `kind` with random parameters from `rng`. Raises UserError for an unknown
         kind."""
         check_light(kind)
         drawn = draw(_tables(), kind, rng)
@@ -68,7 +69,7 @@ class Light:
 
     @property
     def sun_direction(self) -> tuple[float, float, float]:
-        """Unit vector towards the sun."""
+        """Unit vector (x, y, z) towards the sun, world."""
         level = math.cos(self.sun_elevation)
         return (
             level * math.cos(self.sun_azimuth),
@@ -85,13 +86,13 @@ def check_light(kind: str) -> None:
 
 @cache
 def _tables() -> Tables:
-    """The table of each kind, from light.toml, which explains the entries."""
+    """Return the tables of light.toml by kind; that file explains the entries."""
     text = files("simulator.camera.scene").joinpath("light.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 
 def _tinted_sun(kind: str, colour: list[float], strength: float, elevation: float) -> Colour:
-    """The sun's light in clear air, redder the lower the sun; at dusk `strength` adds no blue."""
+    """Return the sun's colour in clear air, redder at low elevation; at dusk blue is unscaled."""
     red, green, blue = colour
     if kind == "dusk":
         return red * strength, green * strength, blue

@@ -1,4 +1,4 @@
-"""The uniform block `Look` of look.glsl: the values of a look that a varied road's shaders read."""
+"""Fills the uniform block `Look` of look.glsl with the values of a varied road's look."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +10,16 @@ from simulator.track.road import Road
 from simulator.varied.look import Lighting, Paint, RoadLook, Surface
 
 MARKINGS, LINES = 4, 2
-"""Largest number of markings of a road, and of lines of a marking, that the block holds."""
+"""Largest number of markings of a road, and of lines of a marking, in the block."""
 LINE_COLOURS: dict[str, Colour] = {"white": (0.78, 0.78, 0.75), "yellow": (0.75, 0.50, 0.06)}
 ARROWS = {"ahead": 0.0, "left": 1.0, "right": -1.0}
 LAMP_SIDE = -1.0
-"""Side of the street lamps of a varied road: -1 is right."""
+"""Side of the street lamps of a varied road; -1 is right."""
 Row = tuple[float, ...]
 
 
 def look_block(road: Road, look: RoadLook) -> NDArray[np.float32]:
-    """The block (rows, 4) of `look` on `road`, in the order of look.glsl."""
+    """Return the block (rows, 4) of `look` on `road`, in the order of look.glsl."""
     rows = [
         *_side_rows(road),
         *_line_rows(road, look.paint),
@@ -37,7 +37,7 @@ def _side_rows(road: Road) -> list[Row]:
 
 
 def _line_rows(road: Road, paint: Paint) -> list[Row]:
-    """Places and patterns of the lines of all markings, then their colours."""
+    """Return position and pattern of the lines of all markings, then their colours."""
     assert road.carriageway is not None
     places: list[Row] = [(0.0, -1.0, 0.0, 1.0)] * (MARKINGS * LINES)
     colours: list[Row] = [(0.0, 0.0, 0.0, 0.0)] * (MARKINGS * LINES)
@@ -82,7 +82,7 @@ def _surface_rows(surface: Surface) -> list[Row]:
 
 
 def surface_features(surface: Surface) -> tuple[str, ...]:
-    """The features of surface.glsl that this surface needs; each further one would cost time."""
+    """Return the features of surface.glsl that this surface needs; unused ones would cost time."""
     wanted = {
         "slabs": surface.other_tone > 0.0 or surface.concrete > 0.0,
         "repairs": surface.tar > 0.0 or surface.patches > 0.0,

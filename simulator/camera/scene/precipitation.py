@@ -1,8 +1,8 @@
-"""Rain and snow in front of the camera, as short streaks.
+"""Draws rain and snow in front of the camera as short streaks.
 
-The drops are fixed in a box of air that repeats through the world, so they pass by as the camera
-moves. How far they have fallen is a hash of the camera position, so no clock is needed: the same
-pose gives the same drops. World frame, metres.
+The drops have fixed positions in a box of air that repeats through the world, so they pass the
+camera as it moves. The distance that they have fallen is a hash of the camera position, because
+there is no clock: the same pose gives the same drops. World frame, metres.
 """
 
 import math
@@ -16,13 +16,13 @@ from simulator.camera.core.optics import Eye
 from simulator.camera.scene.light import Light
 
 CAR_SPEED = 15.0
-"""m/s; the assumed speed of the car, which sets the slant of the streaks."""
+"""Assumed speed of the car in m/s; it determines the slant of the streaks."""
 
 
 @dataclass(frozen=True)
 class Drops:
-    """Parameters of rain or snow: side of the box of air (m), drops in it at the highest density,
-    fall speed (m/s), exposure time (s), width (m) and opacity of a drop."""
+    """Parameters of rain or snow: side of the box of air (m), number of drops in it at the highest
+    density, fall speed (m/s), exposure time (s), width (m) and opacity (0 to 1) of a drop."""
 
     box_m: float
     most: int
@@ -38,7 +38,7 @@ _CORNERS = np.array([[-1, 0], [1, 0], [-1, 1], [-1, 1], [1, 0], [1, 1]], dtype=n
 
 
 class Precipitation:
-    """The rain or snow of one scene, drawn last."""
+    """The rain or snow of one scene; it is drawn after everything else."""
 
     def __init__(self, graphics: Graphics, light: Light, seed: int) -> None:
         self._drops = SNOW if light.weather == "snow" else RAIN
@@ -58,7 +58,7 @@ class Precipitation:
         }
 
     def draw(self, eye: Eye, focal_px: float) -> None:
-        """Draw the drops in front of `eye`; blending must be on."""
+        """Draw the drops in front of `eye`; blending must be enabled."""
         drops = self._drops
         shift = np.append(-eye.place, 0.0) / drops.box_m
         shift[2] += _fall_phase(eye.place)
@@ -71,7 +71,7 @@ class Precipitation:
 
 
 def _fall_phase(place: NDArray[np.float64]) -> float:
-    """Fall distance as a share of the box: a hash of the camera position in millimetres."""
+    """Return the fallen distance as a share of the box: a hash of the camera position in mm."""
     x, y, z = (round(float(v) * 1000.0) for v in place)
     mixed = (x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)
     return math.fmod((mixed % 1_000_003) * 0.6180339887498949, 1.0)

@@ -1,7 +1,7 @@
-"""Props beside the road: houses, grandstands, signs, marker posts, poles, lamps.
+"""Builds the props beside the road: houses, grandstands, signs, marker posts, poles, lamps.
 
-Each is a template in its own frame (x along the road, y away from it, z up, metres) that is placed
-many times in the world frame (metres).
+Each prop is a template in its own frame: x along the road, y away from it, z up, metres. Templates
+are placed many times in the world frame (metres). Triangles are vertices (n, 12) as in `solids`.
 """
 
 import math
@@ -34,10 +34,10 @@ LAYOUT = ("3f 3f 3f 2f", "at", "facing", "colour", "face")
 """Layout of a vertex: the layout of `solids` without the material."""
 CHUNK_M, REACH_M = 50.0, 350.0
 SMALL_M2, SMALL_REACH_M = 14.0, 130.0
-"""Props of less area (posts, lamps, signs) are drawn only up to this distance: farther away they
-would flicker."""
+"""Props with a smaller area than SMALL_M2 (posts, lamps, signs) are drawn only up to SMALL_REACH_M,
+because they would flicker farther away."""
 BUILDING_M = 3.9
-"""A prop that extends farther than this from its middle is a building."""
+"""A prop that extends farther than this from its origin counts as a building."""
 BUILDING_CLEAR_M = 1.0
 """Least distance between a building and the wall line."""
 OUTLINE_STEP_M = 2.0
@@ -54,7 +54,7 @@ _BOARDS: tuple[Point, ...] = (
 
 
 def house(rng: np.random.Generator) -> FloatArray:
-    """A house of one to three floors under a gabled roof."""
+    """Build a house of one to three floors under a gabled roof."""
     wide, deep = rng.uniform(8.0, 15.0), rng.uniform(7.0, 10.0)
     high = 2.9 * rng.integers(1, 4) + 0.4
     wall, roof = _WALLS[rng.integers(len(_WALLS))], _ROOFS[rng.integers(len(_ROOFS))]
@@ -78,7 +78,7 @@ def house(rng: np.random.Generator) -> FloatArray:
 
 
 def grandstand(rng: np.random.Generator) -> FloatArray:
-    """A grandstand: rising tiers full of people under a roof."""
+    """Build a grandstand: rising tiers full of people under a roof."""
     wide = float(rng.uniform(25.0, 45.0))
     colour = _BOARDS[rng.integers(len(_BOARDS))]
     parts = [box((wide, 1.0, 2.6), (0.0, -5.0, -1.0), colour)]
@@ -92,11 +92,11 @@ def grandstand(rng: np.random.Generator) -> FloatArray:
 
 
 def sign(rng: np.random.Generator) -> FloatArray:
-    """A board on two legs, facing traffic that drives along +x."""
+    """Build a board on two legs that faces traffic driving along +x."""
     wide, high = float(rng.uniform(0.8, 3.4)), float(rng.uniform(0.7, 1.5))
     foot = float(rng.uniform(1.3, 2.0))
     board = box((0.06, wide, high), (0.0, 0.0, foot), _BOARDS[rng.integers(len(_BOARDS))], BOARD)
-    # The lettering of a board is placed in shares of the board's size.
+    # The shader places the lettering in shares of the board's size.
     board[:, 9] /= wide
     board[:, 10] /= high
     legs = [
@@ -107,12 +107,12 @@ def sign(rng: np.random.Generator) -> FloatArray:
 
 
 def marker_post() -> FloatArray:
-    """A white marker post with a dark band."""
+    """Build a white marker post with a dark band."""
     return box((0.09, 0.12, 1.3), (0.0, 0.0, -0.3), (0.72, 0.72, 0.70), STRIPED)
 
 
 def apartment_block(rng: np.random.Generator) -> FloatArray:
-    """A building of four to nine floors under a flat roof."""
+    """Build an apartment block of four to nine floors under a flat roof."""
     wide, deep = float(rng.uniform(12.0, 26.0)), float(rng.uniform(9.0, 13.0))
     high = float(2.9 * rng.integers(4, 10) + 0.4)
     wall = _WALLS[rng.integers(len(_WALLS))]
@@ -126,14 +126,14 @@ def apartment_block(rng: np.random.Generator) -> FloatArray:
 
 
 def pole() -> FloatArray:
-    """A telegraph pole of wood with two cross-arms."""
+    """Build a wooden telegraph pole with two cross-arms."""
     wood, mast = (0.13, 0.09, 0.06), (0.22, 0.22, 9.0)
     arms = [box((0.12, 2.0, 0.12), (0.0, 0.0, z), wood) for z in (6.9, 7.6)]
     return np.concatenate([box(mast, (0.0, 0.0, -0.9), wood), *arms])
 
 
 def lamp(head: float = PLAIN) -> FloatArray:
-    """A lamp on a tall mast with its arm over the road (-y); `head` is the material of its head."""
+    """Build a lamp on a tall mast, its arm over the road (-y), its head of material `head`."""
     grey = (0.24, 0.25, 0.25)
     return np.concatenate(
         [
@@ -145,7 +145,7 @@ def lamp(head: float = PLAIN) -> FloatArray:
 
 
 class _Placer:
-    """Places templates beside the road and collects their triangles."""
+    """Selects the positions of props beside the road and collects their triangles."""
 
     def __init__(self, ground: Ground, bridges: Sequence[Bridge]) -> None:
         self.ground, self.bridges = ground, bridges
@@ -154,12 +154,12 @@ class _Placer:
         self.parts: list[FloatArray] = []
 
     def add(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Add `template` at (s, offset) to the candidates of `place`."""
+        """Add `template` (n, 12) at (`s`, `offset`) m to the candidates of `place`."""
         self.candidates.append((template, s, offset, clear_m))
 
     def place(self) -> None:
-        """Place the candidates in order; skip those within `clear_m` of a wall line, near a bridge,
-        below the sea level or, for buildings, overlapping the road or another one."""
+        """Place the candidates in order. Skip candidates within `clear_m` of a wall line, near a
+        bridge, below the sea level or, for buildings, overlapping the road or another building."""
         if not self.candidates:
             return
         templates, *numbers = zip(*self.candidates, strict=True)
@@ -194,13 +194,13 @@ class _Placer:
             self.add_placed(s[k], placed)
 
     def add_placed(self, s: float, triangles: FloatArray) -> None:
-        """Add triangles (n, 12) in the world frame, near `s`."""
+        """Add triangles (n, 12) in the world frame, near `s` (m)."""
         self.s.append(s)
         self.parts.append(triangles)
 
 
 def _outline(template: FloatArray) -> FloatArray:
-    """Points (n, 2) on the bounding rectangle of `template`, at most OUTLINE_STEP_M apart."""
+    """Return points (n, 2) on `template`'s bounding rectangle, at most OUTLINE_STEP_M apart."""
     low, high = template[:, :2].min(axis=0), template[:, :2].max(axis=0)
     x, y = (
         np.linspace(a, b, math.ceil((b - a) / OUTLINE_STEP_M) + 1)
@@ -218,8 +218,8 @@ def build(
     rng: np.random.Generator,
     lit_every_m: float = 0.0,
 ) -> dict[str, Surface]:
-    """All props and bridges of a scene by material; lit lamps stand on the right, every
-    `lit_every_m`."""
+    """Build all props and bridges of a scene; returns a surface for each material. Lit lamps are
+    placed on the right side every `lit_every_m` (0: none)."""
     placer = _Placer(ground, bridges)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)
@@ -253,7 +253,7 @@ def build(
 
 
 def _gathered(placer: _Placer) -> dict[str, Surface]:
-    """The triangles of all props by the name of their material."""
+    """Group the triangles of all props by the name of their material."""
     small = [_area(part) < SMALL_M2 for part in placer.parts]
     surfaces = {}
     for number, material in enumerate(MATERIALS):
@@ -269,8 +269,8 @@ def _gathered(placer: _Placer) -> dict[str, Surface]:
 
 
 def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -> Surface:
-    """Triangles of one material in order of s, with a chunk every CHUNK_M. In each chunk the
-    triangles of small props come last, because the second level of detail leaves them out."""
+    """Build the surface of one material, in order of s, with a chunk every CHUNK_M. In each chunk
+    the triangles of small props come last, because the second level of detail leaves them out."""
     cell = (s / CHUNK_M).astype(np.int64)
     order = np.lexsort((s, small, cell))
     sizes = np.array([len(part) for part in parts])[order]
@@ -294,6 +294,6 @@ def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -
 
 
 def _area(triangles: FloatArray) -> float:
-    """Area (m2) of triangles (3 T, ...); the first three values of each vertex are its position."""
+    """Return the area (m2) of triangles (3 T, ...); a vertex begins with its position."""
     a, b, c = (triangles[k::3, :3] for k in range(3))
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)

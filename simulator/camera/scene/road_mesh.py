@@ -1,8 +1,8 @@
-"""The triangle mesh of the road: rows of vertices across the track, with (s, y) per vertex.
+"""The triangle mesh of the road: rows of vertices across the track, each vertex with its (s, y).
 
-World frame, metres; s along the centre line, y left positive. Rows lie close enough that the chord
-between two of them deviates from the true arc by less than `SAGITTA_M`. What the shader paints
-at (s, y) therefore lies where the track geometry has it.
+World frame, metres; s along the centre line, y left positive. Rows are so close that the chord
+between two rows deviates from the true arc by less than `SAGITTA_M`. So the paint that the shader
+draws at (s, y) lies where the track geometry has that point.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ LAYOUT = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
 SAGITTA_M = 0.0025
 LONGEST_ROW_M = 4.0
 TWIST_M = 0.004
-"""Largest deviation of two triangles from the twisted road plane between two rows."""
+"""Largest deviation (m) of two triangles from the twisted road plane between two rows."""
 SKIRT_M = 10.0
-"""How far the mesh extends beyond the wall line."""
+"""Largest width of a skirt, the part of the mesh between wall line and terrain."""
 KERB_CURVATURE = 1.0 / 220.0
 SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
 """Weights of geometric errors on the skirt and the kerb, relative to errors on the road."""
@@ -35,22 +35,24 @@ VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0
 """Levels of detail of the verge, coarser than the levels of the asphalt."""
 LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
 """Overlap of the verge below the asphalt (m), its depth there (m), and the weight of its height
-error, which keeps it below the asphalt at every level of detail."""
+error. The weight keeps the verge below the asphalt at every level of detail."""
 
 
 @dataclass(frozen=True)
 class RoadMesh:
-    """Vertices of the road: rows `s` (R,), lateral columns `y` (R, C) and points (R, C, 3)."""
+    """Vertices of the road. `s` (R,) are the rows, `y` (R, C) the lateral offsets of their columns,
+    left to right, and `points` (R, C, 3) the positions; m. `curvature` (R,) is in 1/m."""
 
     s: FloatArray
     y: FloatArray
     points: FloatArray
     curvature: FloatArray
     wall: tuple[int, int]
-    """Columns of the left and the right wall line."""
+    """Indices of the columns of the left and the right wall line."""
 
     def ground(self, row: NDArray[np.intp], offset: FloatArray) -> FloatArray:
-        """Height of the mesh at lateral `offset` of a row, by the nearest columns."""
+        """Return the height (n,) m of the mesh in the rows `row` (n,) at lateral `offset` (n,) m,
+        interpolated between the nearest columns."""
         y, z = self.y[row], self.points[row, :, 2]
         column = np.clip(np.sum(y > offset[:, None], axis=1), 1, y.shape[1] - 1)
         pick = np.arange(len(row))
@@ -60,7 +62,7 @@ class RoadMesh:
 
 
 def rows_of(road: Road) -> FloatArray:
-    """Positions s of the rows, from 0 to the track's length, both included."""
+    """Return the positions s (R,) m of the rows, from 0 to the track's length, both included."""
     track = road.track
     radius = 1.0 / np.maximum(np.abs(track.curvature0), 1e-9)
     step = np.sqrt(8.0 * radius * SAGITTA_M)
@@ -77,7 +79,7 @@ def rows_of(road: Road) -> FloatArray:
 
 
 def build(road: Road, line: CentreLineSamples, terrain: Terrain) -> RoadMesh:
-    """Build the mesh, with skirts that end below the terrain."""
+    """Build the mesh of `road`, with skirts that end below the terrain."""
     s = rows_of(road)
     pose = road.track.at(s)
     wall = road.wall_offset
@@ -102,7 +104,8 @@ def build(road: Road, line: CentreLineSamples, terrain: Terrain) -> RoadMesh:
 def _skirt(
     road: Road, line: CentreLineSamples, s: FloatArray, curvature: FloatArray, side: float
 ) -> FloatArray:
-    """Width of the skirt on one side (+1 left), limited so that it overlaps no part of the road."""
+    """Return the width (R,) m of the skirt on one side (1 left, -1 right), limited so that it
+    overlaps no part of the road."""
     width = np.full(len(s), 0.4)
     for share in (0.25, 0.5, 0.75, 1.0):
         offset = road.wall_offset + SKIRT_M * share
@@ -111,21 +114,21 @@ def _skirt(
         # Beyond the centre of a bend the mesh would fold over.
         clear &= curvature * side * offset < 0.85
         width = np.where(clear & (width >= SKIRT_M * (share - 0.25) - 0.1), SKIRT_M * share, width)
-    # A width that jumps would leave gaps at the edge; take the narrowest neighbour.
+    # A jump of the width would leave gaps at the edge, so the narrowest neighbour is used.
     for _ in range(2):
         width = np.minimum(width, np.minimum(np.roll(width, 1), np.roll(width, -1)))
     return width
 
 
 def covers(mesh: RoadMesh, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
-    """Mask (rows, columns) of the grid points that the mesh covers, `margin_m` inside its edges."""
+    """Return a mask (rows, columns) of grid points at least `margin_m` inside the mesh's edges."""
     row = np.clip(np.searchsorted(mesh.s, survey.line.s), 1, len(mesh.s) - 1)[survey.sample]
     reach = np.minimum(mesh.y[:, 0], -mesh.y[:, -1])
     return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
 
 
 def surfaces(mesh: RoadMesh, road: Road) -> dict[str, Surface]:
-    """Surfaces of the asphalt and, after it, the verges, by the names of their programs."""
+    """Build the surfaces "paved" (asphalt) and "verge", named after the programs that draw them."""
     rows, columns = mesh.y.shape
     vertices = np.empty((rows, columns, 9), dtype=np.float32)
     vertices[..., 0:3] = mesh.points
@@ -146,8 +149,8 @@ def surfaces(mesh: RoadMesh, road: Road) -> dict[str, Surface]:
 
 
 def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The vertices with the verge's inner edges moved below the asphalt, so that no gap opens
-    between different levels of detail."""
+    """Return the vertices with the inner edges of the verge moved below the asphalt, so that no gap
+    opens between different levels of detail."""
     vertices = vertices.copy()
     for inner, outer in ((3, 2), (4, 5)):
         step = np.sign(vertices[:, inner, 4] - vertices[:, outer, 4])[:, None] * LAP_M
@@ -168,7 +171,7 @@ def _normals(mesh: RoadMesh) -> FloatArray:
 
 
 def _kerb(mesh: RoadMesh, road: Road) -> FloatArray:
-    """1 where kerbs stand beside the asphalt, 0 elsewhere, with short ramps between."""
+    """Return the kerb (R,): 1 in rows with kerbs, 0 elsewhere, with short ramps between."""
     bend = np.abs(mesh.curvature) > KERB_CURVATURE
     kerb = bend.astype(np.float64) * float(road.track.markings.kerbs)
     for _ in range(2):
@@ -178,7 +181,7 @@ def _kerb(mesh: RoadMesh, road: Road) -> FloatArray:
 
 @dataclass(frozen=True)
 class Ground:
-    """What a scene stands on: the road with its centre line and mesh, and the terrain."""
+    """The ground of a scene: the road with its centre line and mesh, and the terrain."""
 
     road: Road
     line: CentreLineSamples
@@ -187,27 +190,27 @@ class Ground:
 
     @classmethod
     def of(cls, road: Road, line: CentreLineSamples, terrain: Terrain) -> Self:
-        """The ground of `road`, its mesh built."""
+        """Build the road mesh and return the ground of `road`."""
         return cls(road, line, build(road, line, terrain), terrain)
 
     def place_beside(
         self, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
     ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-        """Mask of the points (s, offset) that lie `clear_m` outside all wall lines, and x and y (m,
-        world) of all points."""
+        """Return a mask of the points (s, offset) that lie at least `clear_m` outside all wall
+        lines, and x, y (m, world) of all points."""
         pose = self.road.track.at(s, offset)
         near = self.line.distance(pose.x, pose.y)
         free = near > self.road.wall_offset + clear_m
         return free, pose.x, pose.y
 
     def is_clear(self, points: FloatArray, clear_m: float) -> bool:
-        """Whether all points (n, 2) are `clear_m` outside every wall line."""
+        """Return whether all points (n, 2) lie at least `clear_m` outside every wall line."""
         near = self.line.distance(points[:, 0], points[:, 1])
         return bool((near > self.road.wall_offset + clear_m).all())
 
     def height(self, s: FloatArray, offset: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Visible height (m) at points: the height of the terrain, or of the road mesh's skirt
-        where that is higher."""
+        """Return the visible height (m) at points, given as track and world coordinates: that of
+        the terrain, or of the road mesh's skirt if it is higher."""
         mesh = self.mesh
         row = np.clip(np.searchsorted(mesh.s, s), 0, len(mesh.s) - 1)
         skirt = mesh.ground(row, offset)

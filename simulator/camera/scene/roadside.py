@@ -1,4 +1,4 @@
-"""Changes the roadside as a varied road's look requires: barriers, theme, parked cars. Metres."""
+"""Applies the look of a varied road to its roadside: barriers, theme and parked cars. Metres."""
 
 from dataclasses import dataclass, replace
 
@@ -10,16 +10,16 @@ from simulator.track.road import Road
 from simulator.varied.look import RoadLook
 
 DRIVEN_M = 1.35
-"""Distance beyond the outermost marking that a car's centre can reach: datagen's trajectories."""
+"""Largest distance of a car's centre beyond the outermost marking on datagen's trajectories."""
 PARKED_M = 2.1
 """Width of the strip that a parked car needs."""
 BRIDGES = ("overpass", "footbridge", "gantry", "railway")
-"""Styles of bridges for scenery themes without bridges."""
+"""Styles of bridges that are used if a scenery theme has no bridges of its own."""
 
 
 @dataclass(frozen=True)
 class NearRoad(Road):
-    """A road whose barriers are drawn nearer to the asphalt than cars hit them."""
+    """A road for drawing, with barriers nearer to the asphalt than the walls that cars hit."""
 
     gap_m: float = 0.0
     """Least distance from the asphalt to the barriers."""
@@ -32,14 +32,14 @@ class NearRoad(Road):
 
 
 def seen_road(road: Road, look: RoadLook | None) -> Road:
-    """The road to draw: with nearer barriers if `look` has a gap for them."""
+    """Return the road to draw; its barriers are nearer if `look` sets a gap for them."""
     if look is None or look.roadside.gap_m < 0.0:
         return road
     return NearRoad(road.track, road.lanes, road.lane_width, road.carriageway, look.roadside.gap_m)
 
 
 def seen_theme(theme: Theme, look: RoadLook | None) -> Theme:
-    """The scenery theme to draw: `theme` with the trees, grass, lamps and bridges of `look`."""
+    """Return the scenery theme to draw: `theme` with `look`'s trees, grass, lamps and bridges."""
     if look is None:
         return theme
     roadside, lit = look.roadside, look.light.night and look.light.lamp_every_m > 0.0
@@ -61,8 +61,8 @@ def _mixed(one: Colour, other: Colour, share: float) -> Colour:
 
 
 def parked_cars(road: Road, every_m: float, rng: np.random.Generator) -> FloatArray:
-    """Poses (n, 6), on the ground, of cars parked along `road`: on a wide shoulder, otherwise
-    beside the asphalt where there is room before the barriers."""
+    """Return poses (n, 6), on the ground, of cars parked along `road`, on average every `every_m`.
+    They stand on the shoulder if it is wide enough, else beside the asphalt if there is room."""
     if every_m <= 0.0:
         return np.empty((0, 6))
     poses = []

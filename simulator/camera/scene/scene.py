@@ -41,7 +41,7 @@ _CONCRETE: Colour = (0.21, 0.205, 0.19)
 
 @dataclass(frozen=True)
 class VisibleScene:
-    """The visible part of a scene from one viewpoint: index runs of its meshes, and its trees."""
+    """The part of a scene visible from one eye: index runs of its meshes, and its trees."""
 
     solid: tuple[tuple[Mesh, list[list[int]]], ...]
     barriers: list[list[int]]
@@ -49,7 +49,7 @@ class VisibleScene:
 
 
 class Scene:
-    """The static scene of one road, seed and light. `draw` uses the bound frame uniforms."""
+    """The static scene of one road, seed and light. `draw` uses the bound uniform block `Frame`."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class Scene:
         self._shadow_texture = graphics.texture(self.mask.texels)
 
     def visible(self, eye: Eye, planes: FloatArray) -> VisibleScene:
-        """Frustum culling: what is visible from `eye` within the side planes `planes` (4, 3)."""
+        """Return the parts visible from `eye` within the side planes `planes` (4, 3)."""
         return VisibleScene(
             tuple((mesh, mesh.visible(eye.place, planes)) for mesh in self._solid),
             self._barriers.visible(eye.place, planes),
@@ -119,7 +119,8 @@ class Scene:
         )
 
     def draw(self, seen: VisibleScene, labels: bool) -> None:
-        """Draw all opaque parts but the sky, nearest first: the depth test skips hidden pixels."""
+        """Draw all opaque parts but the sky, nearest first, so the depth test skips hidden
+        pixels."""
         self._block.bind_to_uniform_block(SCENE_BINDING)
         if self._look is not None:
             self._look.bind_to_uniform_block(LOOK_BINDING)
@@ -131,7 +132,7 @@ class Scene:
             self._barriers.draw(seen.barriers, labels)
 
     def draw_blended(self, seen: VisibleScene) -> None:
-        """Draw the transparent parts; call it after all opaque ones."""
+        """Draw the transparent parts. Call this after all opaque parts are drawn."""
         self._barriers.draw(seen.barriers, labels=False)
         self._trees.draw(seen.trees, "fringe")
 
@@ -139,7 +140,7 @@ class Scene:
 def scene_block(
     road: Road, theme: Theme, rng: np.random.Generator, mask: shadow_mask.ShadowMask, sea: float
 ) -> NDArray[np.float32]:
-    """The uniform block `Scene` of frame.glsl, (10, 4) float32."""
+    """Return the uniform block `Scene` of frame.glsl, (10, 4) float32."""
     marks, concrete = road.track.markings, road.track.surface == "concrete"
     tone = rng.uniform(0.72, 1.35)
     worn = float(np.clip(theme.worn * rng.uniform(0.4, 1.5), 0.0, 1.0))

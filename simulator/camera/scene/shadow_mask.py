@@ -1,7 +1,7 @@
-"""Shadows of bridges and trees on the road: a mask over (s, y), 0 in the sun to 255 in shadow.
+"""Shadows of bridges and trees on the road: a mask over (s, y), from 0 in the sun to 255 in shadow.
 
 The mask is as wide as the road mesh and centred on y = 0. It is folded into bands of `BAND_TEXELS`
-along s, each with `GUARD` more texels on both sides, so that a long track fits one texture.
+along s, each with `GUARD` additional texels at both ends, so that a long track fits one texture.
 """
 
 import math
@@ -23,7 +23,7 @@ from simulator.camera.vegetation.scenery import Trees
 from simulator.track.road import Road
 
 Strip = NDArray[np.uint8]
-"""An unfolded mask: (rows, columns), from right to left and once round the track."""
+"""An unfolded mask (rows, columns): rows from right to left, columns once round the track."""
 
 TEXEL_M = 0.25
 GUARD, BAND_TEXELS = 8, 4080
@@ -34,13 +34,13 @@ RUN_OUT_M = (2.0, 5.5)
 WINDOW_M = 12.0
 """Length of a window of the canopy; each window has its own covered share."""
 THINS_OUT_M = 5.0
-"""Distance beyond the wall line over which the canopy thins out to nothing."""
+"""Distance beyond the wall line over which the canopy fades to nothing."""
 SHARE = (0.40, 0.64)
-"""Bounds of the covered share of the asphalt in a window, bridges included."""
+"""Bounds of the covered share of the asphalt in a window, including shadows of bridges."""
 FINE = 2
-"""Rays per texel in each direction; their mean smooths the edge over a texel."""
+"""Rays per texel in each direction; their mean smooths the shadow's edge over a texel."""
 ROAD_Z_M = 2.5
-"""Largest difference in height between the road near a bridge and the road below it."""
+"""Largest height of a bridge's origin above the road on which its shadow falls."""
 FARTHEST_M = 70.0
 SKY_BLUR_M = 3.0
 """Distance beyond a bridge's edges within which the bridge hides a part of the sky."""
@@ -48,16 +48,17 @@ SKY_BLUR_M = 3.0
 
 @dataclass(frozen=True)
 class ShadowMask:
-    """The mask as a `strip`, and folded into `texels` (bands * rows, BAND_TEXELS + ...). On varied
-    roads the texels have a second component, the share of the sky that bridges hide."""
+    """The mask, unfolded as `strip` and folded as `texels` (bands * rows, BAND_TEXELS + 2 GUARD).
+    On varied roads the texels have a second component, the share of the sky that bridges hide."""
 
     strip: Strip
     texels: NDArray[np.uint8]
     along_m: float
-    """Length of a texel along s; a whole number of texels fits the track."""
+    """Length of a texel along s; the track's length is a whole number of texels."""
 
     def fraction(self, s: float, half_width: float) -> float:
-        """Share in shadow of the road within `half_width` of its centre, from s to s + LOOK_M."""
+        """Return the shadowed share of the road within `half_width` of its centre, for LOOK_M from
+        s."""
         middle = self.strip.shape[0] // 2
         reach = min(int(half_width / TEXEL_M), middle)
         rows = self.strip[middle - reach : middle + reach]
@@ -66,7 +67,7 @@ class ShadowMask:
 
 @compiled
 def _dark_share(rows: Strip, first: int, count: int) -> float:
-    """Share of dark texels in `count` columns from `first` on; columns wrap round the track."""
+    """Return the share of dark texels in `count` columns from `first`, wrapping round the track."""
     dark, columns = 0, rows.shape[1]
     for row in rows:
         for k in range(first, first + count):
@@ -84,10 +85,10 @@ def build(
     *,
     sky: bool = False,
 ) -> ShadowMask:
-    """The shadows of `light` on `road`, cast by bridges and by trees or a closed canopy; with `sky`
-    also the share of the sky that bridges hide.
+    """Compute the shadows on `road` in `light`, cast by bridges and by trees or a closed canopy;
+    with `sky` also the share of the sky that bridges hide.
 
-    Towards its sides the mask fades into the shade of the `land`, so that no edge shows.
+    At its sides the mask fades into the shade of `land`, so that no edge is visible.
     """
     columns = max(GUARD, round(road.track.length_m / TEXEL_M))
     rows = 8 * int(np.ceil((road.wall_offset + SKIRT_M + 1.0) / TEXEL_M / 4.0))
@@ -110,8 +111,8 @@ def build(
 def _hidden_sky(
     shape: tuple[int, ...], road: Road, along_m: float, bridges: Sequence[Bridge], light: Light
 ) -> Strip:
-    """Share (rows, columns) of the sky that bridges hide, 0 to 255: the footprints of the bridges,
-    blurred by a bridge's height."""
+    """Return the share (rows, columns) of the sky that bridges hide, 0 to 255: the footprints of
+    the bridges, blurred over SKY_BLUR_M."""
     below: Strip = np.zeros(shape, dtype=np.uint8)
     cast_bridges(below, road, along_m, bridges, replace(light, sun_elevation=math.pi / 2))
     size = (2 * round(SKY_BLUR_M / along_m) + 1, 2 * round(SKY_BLUR_M / TEXEL_M) + 1)
@@ -119,7 +120,7 @@ def _hidden_sky(
 
 
 def _run_out(strip: Strip, road: Road, along_m: float, land: TreeShade) -> None:
-    """Fade the mask into the smooth shade of the terrain beyond the wall lines."""
+    """Fade the mask, in place, into the smooth shade of the terrain beyond the wall lines."""
     rows, columns = strip.shape
     begin, end = RUN_OUT_M
     y = (np.arange(rows) + 0.5 - rows / 2) * TEXEL_M
@@ -149,13 +150,13 @@ def _folded(strip: Strip) -> NDArray[np.uint8]:
 
 
 def _cast_trees(strip: Strip, road: Road, along_m: float, trees: Trees, light: Light) -> None:
-    """Project the silhouette of each tree onto the road plane where its shadow reaches the road."""
+    """Project the silhouette of each tree whose shadow reaches the road onto the road plane."""
     silhouettes = foliage.silhouettes()
     sx, sy, sz = light.sun_direction
     level = max(float(np.hypot(sx, sy)), 1e-6)
     length = np.minimum(trees.height * level / max(sz, 0.05), LONGEST_SHADOW_M)
     heading = road.track.at(trees.s).heading
-    # The shadow's direction in the track frame at the tree's foot.
+    # Direction of the shadow in the track frame at the tree's foot.
     ds = -(np.cos(heading) * sx + np.sin(heading) * sy) / level
     dy = -(-np.sin(heading) * sx + np.cos(heading) * sy) / level
     tip = trees.offset + length * dy
@@ -173,7 +174,8 @@ def _cast_trees(strip: Strip, road: Road, along_m: float, trees: Trees, light: L
 def _stamp(
     strip: Strip, shape: NDArray[np.uint8], foot: FloatArray, axis: FloatArray, across: FloatArray
 ) -> None:
-    """Draw `shape` (foot at the bottom middle) over the parallelogram; the darker value stays."""
+    """Draw `shape` (its foot in the middle of the last row) into the parallelogram given by `foot`,
+    `axis` and `across` (column, row); each texel keeps the darker value."""
     corners = np.stack([foot - across / 2, foot + across / 2])
     corners = np.concatenate([corners, corners + axis])
     low = np.floor(corners.min(axis=0)).astype(int)
@@ -192,10 +194,10 @@ def _stamp(
 
 
 def _with_canopy(bridged: Strip, road: Road, along_m: float, rng: np.random.Generator) -> Strip:
-    """The mask `bridged` (rows, columns) of bridge shadows with a canopy added.
+    """Return the mask `bridged` (rows, columns) of bridge shadows with a canopy added.
 
-    A noise field is thresholded. The threshold of each WINDOW_M is chosen so that the covered share
-    of the asphalt equals a random share; where a bridge covers more, no canopy is added.
+    The canopy is a thresholded noise field. The threshold of each WINDOW_M is chosen so that the
+    covered share of the asphalt equals a random share. If a bridge covers more, no canopy is added.
     Over any 30 m the share lies between 0.3 and 0.8.
     """
     rows, columns = bridged.shape
@@ -225,7 +227,7 @@ def _with_canopy(bridged: Strip, road: Road, along_m: float, rng: np.random.Gene
 def _blobs(
     rows: int, columns: int, along_m: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """A field of leaf clumps and boughs (rows, columns), standard deviation 1."""
+    """Return a noise field (rows, columns) of leaf clumps and boughs with standard deviation 1."""
     field = np.zeros((rows, columns), dtype=np.float32)
     # Large clumps need only coarse noise.
     for size_m, weight, coarse in ((3.2, 1.0, 4), (1.3, 0.55, 2), (0.55, 0.3, 1)):
@@ -246,11 +248,11 @@ def cast_bridges(
     bridges: Sequence[Bridge],
     light: Light,
 ) -> None:
-    """Darken the texels of `strip` (rows, columns) from which a bridge hides the sun."""
+    """Darken the texels of `strip` (rows, columns), in place, from which a bridge hides the sun."""
     for bridge in bridges:
         sun = bridge.turned(np.array(light.sun_direction))
         low, high = _reach(bridge.boxes, sun)
-        # On the inside of a bend a metre of s is shorter on the ground, so the range is longer.
+        # On the inside of a bend 1 m of s is shorter on the ground, so the range of s is longer.
         bend = 1.0 / max(0.5, 1.0 - abs(road.track.curvature(bridge.s)) * road.wall_offset)
         first = int((bridge.s + max(low * bend, -FARTHEST_M)) / along_m) - 8
         last = int((bridge.s + min(high * bend, FARTHEST_M)) / along_m) + 9
@@ -260,7 +262,7 @@ def cast_bridges(
 
 
 def _reach(boxes: FloatArray, sun: FloatArray) -> tuple[float, float]:
-    """Where along the road (m from the bridge) the shadows of the boxes begin and end."""
+    """Return the begin and end along the road (m from the bridge) of the shadows of `boxes`."""
     drop = boxes[:, 1, 2] + ROAD_Z_M
     shift = -sun[0] / max(sun[2], 1e-3) * drop
     low = np.minimum(boxes[:, 0, 0], boxes[:, 0, 0] + shift)
@@ -276,7 +278,8 @@ def _darkened(
     rows: int,
     sun: FloatArray,
 ) -> Strip:
-    """The shadow on texels (rows, columns) of the unfolded mask; columns may exceed its ends."""
+    """Return the shadow (rows, columns) of one bridge on `columns` (first, last) of the unfolded
+    mask, which may exceed its ends. `sun` (3,): direction to the sun in the bridge's frame."""
     first, last = columns
     s = (first + (np.arange((last - first) * FINE) + 0.5) / FINE) * along_m
     y = ((np.arange(rows * FINE) + 0.5) / FINE - rows / 2) * TEXEL_M
@@ -292,10 +295,10 @@ def _darkened(
 
 
 def _hit(reached: list[NDArray[np.float32]], box: FloatArray) -> NDArray[np.bool_]:
-    """Mask of the points from which a ray towards the sun meets a box (slab method).
+    """Return a mask of the points from which a ray towards the sun meets a box (slab method).
 
-    Points and box (2, 3) are given along the ray: each coordinate is divided by the ray's slope in
-    that coordinate.
+    Points and box (2, 3) are given in units of the ray: each coordinate is divided by the ray's
+    component along that axis.
     """
     enter = np.zeros_like(reached[0])
     leave = np.full_like(reached[0], np.inf)

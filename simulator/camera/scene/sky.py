@@ -1,6 +1,6 @@
-"""The sky: rendered once per scene to a panorama, which every image shows on a dome.
+"""The sky, rendered once per scene to a panorama that every image shows on a dome.
 
-The sky depends on the direction only, so clouds and glow are not computed again for each frame.
+The sky depends only on the direction, so clouds and glow need not be computed for each frame.
 Panorama and dome have the same triangles, so each direction maps exactly to its texel.
 """
 
@@ -13,15 +13,15 @@ from simulator.camera.core.context import SKY_UNIT, Graphics
 
 SECTORS = 12
 _ROWS = ((-90, 0.0), (-8, 0.02), (12, 0.32), (45, 0.70), (90, 1.0))
-"""Elevation (deg) and height in the panorama of the dome's rows: finest over the horizon."""
+"""Rows of the dome, finest above the horizon: elevation (deg), panorama height (0 to 1)."""
 _SHARPNESS = 0.9
 """Approximate number of texels of the panorama per pixel in the middle of the picture."""
 _WIDTHS = (1024, 4096)
 
 
 class Sky:
-    """The sky of one light, at the resolution for images of focal length `focal_px`. The bound
-    uniform block of the frame must hold this light."""
+    """The sky of one light, for images with the focal length `focal_px`. When it is created, the
+    bound uniform block `Frame` must contain this light."""
 
     def __init__(self, graphics: Graphics, weather: str, focal_px: float) -> None:
         context = graphics.context
@@ -50,7 +50,7 @@ def _panorama_size(focal_px: float) -> tuple[int, int]:
 
 
 def _dome() -> NDArray[np.float32]:
-    """Triangles round the eye (n, 5): direction, position in the panorama (0 to 1)."""
+    """Return triangles round the eye, vertices (n, 5): direction, position in the panorama."""
     azimuth = np.linspace(-np.pi, np.pi, SECTORS + 1)
     elevation, height = np.radians([row[0] for row in _ROWS]), [row[1] for row in _ROWS]
     grid = np.empty((len(_ROWS), SECTORS + 1, 5), dtype=np.float32)

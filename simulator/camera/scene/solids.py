@@ -1,7 +1,7 @@
-"""Boxes and faces, as triangles, from which props and bridges are built.
+"""Boxes and faces as triangles; props and bridges are built of them.
 
-A vertex is position, normal, colour, (u, v) in metres and material number; the frame is that of the
-object, z up, metres.
+A vertex has 12 values: position (3), normal (3), colour (3), texture coordinates u, v in metres,
+and material number. The frame is the object's own, z up, metres.
 """
 
 from collections.abc import Sequence
@@ -14,16 +14,17 @@ from simulator.arrays import FloatArray
 Point = tuple[float, float, float]
 
 MATERIALS = ("plain", "facade", "crowd", "board", "striped", "tiles", "masonry", "earth", "lit")
-"""Names of the materials; the index is the material number, prop.frag.glsl uses the names."""
+"""Names of the materials. The index is the material number; prop.frag.glsl uses the names."""
 PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH, LIT = map(float, range(len(MATERIALS)))
 
 
 def box(
     size: Point, at: Point, colour: Point, material: float = PLAIN, *, floor: bool = False
 ) -> FloatArray:
-    """A box that stands on `at`, the middle of its floor, (30, 12) or with the floor (36, 12).
+    """Return a box of `size` (x, y, z) as vertices (30, 12), or (36, 12) with its floor. `at` is
+    the middle of the floor.
 
-    Its sides are of `material`; the top and floor of a facade box are plain.
+    The sides have the `material`; top and floor too, but those of a facade box are plain.
     """
     rows = _unit_box()[: 36 if floor else 30].copy()
     rows[:, :3] = rows[:, :3] * size + at
@@ -40,7 +41,7 @@ def box(
 
 @cache
 def _unit_box() -> FloatArray:
-    """Six faces of a box of 1 m: the sides +x, -x, +y, -y, the top and the floor."""
+    """Return the faces (36, 12) of a box of 1 m: the sides +x, -x, +y, -y, the top, the floor."""
     up, uv = np.array([0.0, 0.0, 1.0]), ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
     black = (0.0, 0.0, 0.0)
     faces = []
@@ -55,7 +56,7 @@ def _unit_box() -> FloatArray:
 
 
 def _normal(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The cross product of two vectors; numpy's `cross` takes ten times as long."""
+    """Return the cross product of two vectors (3,); `numpy.cross` takes ten times as long."""
     (ax, ay, az), (bx, by, bz) = a, b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
@@ -63,8 +64,8 @@ def _normal(a: FloatArray, b: FloatArray) -> FloatArray:
 def face(
     corners: Sequence[FloatArray], uv: Sequence[tuple[float, float]], colour: Point, material: float
 ) -> FloatArray:
-    """A face of four corners, counter-clockwise from outside, as two triangles (6, 12); two
-    consecutive corners may be equal."""
+    """Return a face with four corners, counter-clockwise from outside, as two triangles (6, 12).
+    Two consecutive corners may be equal. `uv` are the texture coordinates of the corners."""
     rows = np.empty((6, 12))
     order = [0, 1, 2, 0, 2, 3]
     rows[:, :3] = np.array(corners)[order]

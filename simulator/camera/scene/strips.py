@@ -1,7 +1,8 @@
-"""Triangle strips along the road: grids of rows across it, in levels of detail and chunks.
+"""Builds triangle strips along the road from rows of vertices across it, in levels of detail and
+chunks.
 
-A software renderer is slow on triangles smaller than a block of 4 x 4 pixels, so rows are left out
-where the remaining ones describe the surface well enough.
+A software renderer is slow on triangles smaller than a block of 4 x 4 pixels. Therefore rows are
+left out if the remaining rows describe the surface well enough.
 """
 
 from collections.abc import Sequence
@@ -33,7 +34,7 @@ LEVELS = (
     Level(300.0, 0.08, 32.0),
     Level(650.0, 0.3, 64.0),
 )
-"""The levels of detail of the asphalt: errors of about a quarter of a pixel in the driver view."""
+"""Levels of detail of the asphalt; errors are about a quarter of a pixel in the driver view."""
 
 
 def strip(
@@ -44,12 +45,12 @@ def strip(
     cells: Sequence[Sequence[tuple[int, int]]],
     levels: Sequence[Level] = LEVELS,
 ) -> Surface:
-    """Triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3); the rows are at
-    `s` (m) along the road.
+    """Build the triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3), m. The
+    rows are at `s` (R,) m along the road.
 
-    `profile` (R, K) holds the values, in metres, that the kept rows must interpolate; level k joins
-    the pairs of columns `cells[k]`. Rows that bound a chunk stay, so that neighbouring chunks of
-    different levels share their vertices.
+    `profile` (R, K) contains the values, in metres, that interpolation between the kept rows must
+    reproduce. Level k joins the pairs of columns `cells[k]`. The first row of every chunk is kept,
+    so that neighbouring chunks of different levels share their vertices.
     """
     rows, columns = vertices.shape[:2]
     starts = np.arange(0, rows - 1, CHUNK_ROWS)
@@ -81,7 +82,7 @@ def _steps(
     ends: NDArray[np.intp],
     levels: Sequence[Level],
 ) -> NDArray[np.intp]:
-    """Spacing of the kept rows, (levels, chunks)."""
+    """Return the spacing of the kept rows, in rows, for each level and chunk (levels, chunks)."""
     steps = np.ones((len(levels), len(starts)), dtype=np.intp)
     row = np.arange(len(s) - 1)
     chunk = row // CHUNK_ROWS
@@ -99,8 +100,8 @@ def _steps(
 
 
 def _between(rows: NDArray[np.intp], columns: int, sides: NDArray[np.intp]) -> NDArray[np.uint32]:
-    """Indices of two triangles for each pair of columns (n, 2) between consecutive `rows`. The last
-    (provoking) vertex sets the flat attributes of a triangle; it lies in the earlier row."""
+    """Return indices of two triangles for each pair of columns (n, 2) between consecutive `rows`. A
+    triangle's last (provoking) vertex sets its flat attributes; it lies in the earlier row."""
     near, far = columns * rows[:-1, None, None] + sides, columns * rows[1:, None, None] + sides
     corners = [near[..., 0], far[..., 0], near[..., 1], far[..., 0], far[..., 1], near[..., 1]]
     return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

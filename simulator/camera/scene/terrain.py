@@ -1,6 +1,6 @@
 """The terrain round a track: a height grid with hills that stays below the road.
 
-World frame, metres. Below the road the grid is lowered, so that it never pierces the asphalt; the
+World frame, metres. Near the road the grid is lowered, so that it never pierces the asphalt. The
 skirts of the road mesh (`road_mesh`) cover the gap.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CELL_M = 8.0
 COARSEST = 8
-"""The number of cells is a multiple of this step of the coarsest land mesh."""
+"""Step of the coarsest terrain mesh, in cells; the number of cells is a multiple of it."""
 MARGIN_M = 400.0
 MAX_CELLS = 1200
 SAMPLE_M = 2.0
@@ -31,12 +31,12 @@ SEA_BELOW_M = 3.0
 SHORE_M = (14.0, 75.0)
 """Distances from the wall line between which the terrain descends to the sea."""
 BANK_SLOPE = 0.55
-"""Largest slope of the terrain at the roadside."""
+"""Largest slope of the terrain at the roadside, m/m."""
 
 
 @dataclass(frozen=True)
 class CentreLineSamples:
-    """Samples of a road's centre line, every `SAMPLE_M`, with a tree to search them."""
+    """Samples of a road's centre line every `SAMPLE_M` (m, rad), with a tree to search them."""
 
     s: FloatArray
     x: FloatArray
@@ -46,7 +46,7 @@ class CentreLineSamples:
 
     @classmethod
     def of(cls, road: Road) -> "CentreLineSamples":
-        """Sample `road`."""
+        """Sample the centre line of `road`."""
         length = road.track.length_m
         s = np.arange(0.0, length, length / max(8, round(length / SAMPLE_M)))
         pose = road.track.at(s)
@@ -58,14 +58,14 @@ class CentreLineSamples:
         return cls(s, pose.x, pose.y, pose.heading, tree)
 
     def distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Distance (m) from points to the nearest centre-line sample."""
+        """Return the distance (m) from each point x, y (m, world) to the nearest sample."""
         near, _ = self.tree.query(np.stack([x, y], axis=-1))
         return np.asarray(near, dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A square grid from (x0, y0), `cell` m apart: `shape` is (rows along y, columns along x)."""
+    """A square grid from (x0, y0), spacing `cell` m; `shape` is (rows along y, columns along x)."""
 
     x0: float
     y0: float
@@ -74,7 +74,7 @@ class Grid:
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
-        """x of the columns and y of the rows."""
+        """x (m) of the columns and y (m) of the rows."""
         rows, columns = self.shape
         x, y = np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)
         return self.x0 + self.cell * x, self.y0 + self.cell * y
@@ -82,8 +82,8 @@ class Grid:
     def nearest(
         self, x: FloatArray, y: FloatArray
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-        """Column and row of the grid point nearest to each point x, y (m, world), and whether the
-        point is within the grid."""
+        """Return column and row of the grid point nearest to each point x, y (m, world), and
+        whether it is inside the grid."""
         i = np.rint((x - self.x0) / self.cell).astype(np.intp)
         j = np.rint((y - self.y0) / self.cell).astype(np.intp)
         return i, j, (i >= 0) & (j >= 0) & (i < self.shape[1]) & (j < self.shape[0])
@@ -91,11 +91,11 @@ class Grid:
 
 @dataclass(frozen=True)
 class Survey:
-    """Inputs of the terrain that depend on the road alone, computed once for all scenes of a road.
+    """Inputs of the terrain that depend only on the road, computed once for all scenes of a road.
 
-    For each point of the grid: the greatest height that keeps the road clear, the interpolated
-    height of the road, the distance to the road and the index of the nearest sample of its centre
-    line.
+    For each grid point: the greatest height that does not cover the road (`cap`), the smoothed
+    height of the nearest road (`base`), the distance to the centre line (`near`), all in m, and the
+    index of the nearest sample of the centre line (`sample`).
     """
 
     line: CentreLineSamples
@@ -107,7 +107,7 @@ class Survey:
 
     @classmethod
     def of(cls, road: Road) -> "Survey":
-        """The survey of `road`."""
+        """Compute the survey of `road`."""
         line = CentreLineSamples.of(road)
         span = max(np.ptp(line.x), np.ptp(line.y)) + 2 * MARGIN_M
         cell = max(CELL_M, span / MAX_CELLS)
@@ -120,28 +120,28 @@ class Survey:
 
 @dataclass(frozen=True)
 class Terrain:
-    """Heights `z` (rows y, columns x) on a grid."""
+    """Heights `z` (rows along y, columns along x) in m on a grid."""
 
     grid: Grid
     z: FloatArray
     sea: float = -np.inf
-    """Height of the sea level; -inf without a sea."""
+    """Height of the sea level; -inf if there is no sea."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Height in m at the world points x, y in m (arrays of one shape), interpolated on the
-        triangles that are drawn."""
+        """Return the height (m) at the world points x, y (m, arrays of one shape), interpolated on
+        the triangles that are drawn."""
         grid = self.grid
         return between(self.z, (x - grid.x0) / grid.cell, (y - grid.y0) / grid.cell)
 
     def normals(self) -> FloatArray:
-        """Unit normals (rows, columns, 3)."""
+        """Return the unit normals (rows, columns, 3) at the grid points."""
         slope_y, slope_x = np.gradient(self.z, self.grid.cell)
         normal = np.stack([-slope_x, -slope_y, np.ones_like(self.z)], axis=-1)
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
 
 def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Height at column `u` and row `v` of the grid `z`, interpolated on the drawn triangles."""
+    """Return the height at column `u`, row `v` of the grid `z`, interpolated on drawn triangles."""
     rows, columns = z.shape
     u, v = np.clip(u, 0.0, columns - 1.001), np.clip(v, 0.0, rows - 1.001)
     i, j = u.astype(np.intp), v.astype(np.intp)
@@ -155,7 +155,7 @@ def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) -> Terrain:
-    """The terrain round `road` in the style of `theme`."""
+    """Build the terrain round `road` in the style of `theme`."""
     line, grid, near, base = survey.line, survey.grid, survey.near, survey.base
     rolling = _rolling(grid, rng) * theme.hills_m
     away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
@@ -170,7 +170,7 @@ def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) ->
 
 
 def _road_cap(road: Road, line: CentreLineSamples, grid: Grid) -> FloatArray:
-    """The greatest height of each grid point at which it covers no part of the road."""
+    """Return the greatest height (m) of each grid point at which it covers no part of the road."""
     reach = road.wall_offset + 5.0 + 50.0
     offsets = np.arange(-reach, reach + 0.5 * grid.cell, 0.6 * grid.cell)
     s = line.s[:: max(1, round(0.6 * grid.cell / SAMPLE_M))]
@@ -181,7 +181,7 @@ def _road_cap(road: Road, line: CentreLineSamples, grid: Grid) -> FloatArray:
     cap = np.full(grid.shape, np.inf)
     i, j, inside = grid.nearest(pose.x, pose.y)
     np.minimum.at(cap, (j[inside], i[inside]), limit[inside])
-    # A sample limits its neighbours too: erosion is the minimum over 3 x 3.
+    # Each sample also limits its neighbours: erosion is the minimum over 3 x 3 points.
     finite = np.where(np.isfinite(cap), cap, 1e9).astype(np.float32)
     return np.asarray(cv2.erode(finite, np.ones((3, 3), np.uint8)), dtype=np.float64)
 
@@ -189,8 +189,8 @@ def _road_cap(road: Road, line: CentreLineSamples, grid: Grid) -> FloatArray:
 def _spread(
     road: Road, line: CentreLineSamples, grid: Grid
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Smoothed road heights on the grid; each point's distance to the road and the nearest
-    sample of its centre line."""
+    """Return for each grid point the smoothed height of the nearest road (m), the distance (m) to
+    the nearest sample of the centre line, and the index of that sample."""
     points = np.stack(np.meshgrid(*grid.axes), axis=-1).reshape(-1, 2)
     near, index = line.tree.query(points)
     height = road.track.at(line.s).z
@@ -205,7 +205,7 @@ def _spread(
 
 
 def _outside(line: CentreLineSamples, grid: Grid) -> FloatArray:
-    """1 outside the loop of the road, 0 inside, with a smooth transition."""
+    """Return 1 outside the loop of the road and 0 inside, on the grid, with a smooth transition."""
     loop = np.stack([(line.x - grid.x0) / grid.cell, (line.y - grid.y0) / grid.cell], axis=1)
     inside = np.zeros(grid.shape, dtype=np.float32)
     cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)
@@ -213,7 +213,7 @@ def _outside(line: CentreLineSamples, grid: Grid) -> FloatArray:
 
 
 def _rolling(grid: Grid, rng: np.random.Generator) -> FloatArray:
-    """Smooth hills, positive and negative, of standard deviation about 0.5."""
+    """Return smooth hills on the grid, positive and negative, standard deviation about 0.5."""
     shape, cell = grid.shape, grid.cell
     hills = np.zeros(shape)
     for wavelength, weight in ((420.0, 0.45), (160.0, 0.2), (60.0, 0.06)):

@@ -1,4 +1,4 @@
-"""Changes a light as a scene's look requires: exposure, a low sun, or night with headlights."""
+"""Applies the look of a varied road to a light: exposure, a low sun, or night with headlights."""
 
 import math
 from dataclasses import replace
@@ -7,11 +7,11 @@ from simulator.camera.scene.light import Colour, Light
 from simulator.varied.look import Lighting
 
 SUNNY = ("clear", "dusk", "heavy-shadow")
-"""Kinds of light in which the sun may stand low."""
+"""Kinds of light in which a look may lower the sun."""
 USUAL_ALBEDO, COMPENSATED = 0.13, 0.45
 """Albedo of the road for which the lights are exposed; exponent of the automatic exposure."""
 DARKEST_NIGHT_STOPS = -0.5
-"""Least exposure of a night picture; with less the picture would be black."""
+"""Least exposure of a night picture in stops; with less the picture would be black."""
 HEADLIGHT: Colour = (3.4, 3.2, 2.75)
 _NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
 _GLOW: Colour = (0.010, 0.009, 0.010)
@@ -22,8 +22,8 @@ LAMP_GLOW = 0.035
 
 
 def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
-    """`light` changed by `look`, on a road of this albedo (0: the scenery's own). The exposure
-    compensates a part of the albedo, as a camera's automatic exposure does."""
+    """Return `light` changed by `look`, on a road with this `albedo` (0: that of the scenery). Like
+    a camera's automatic exposure, the exposure compensates a part of the albedo."""
     automatic = (USUAL_ALBEDO / albedo) ** COMPENSATED if albedo else 1.0
     stops = look.exposure_stops
     if look.night:
@@ -34,7 +34,7 @@ def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
 
 
 def lamp_colour(look: Lighting) -> Colour:
-    """Light of a street lamp on the road below it; black where none is lit."""
+    """Return the light of a street lamp on the road below it; black if no lamps are lit."""
     if not (look.night and look.lamp_every_m > 0.0):
         return 0.0, 0.0, 0.0
     red, green, blue = (
@@ -45,7 +45,7 @@ def lamp_colour(look: Lighting) -> Colour:
 
 
 def _by_night(light: Light, look: Lighting) -> Light:
-    """`light` by night: only the headlights, the lamps and a glow over the horizon are left. The
+    """Return `light` at night: only headlights, lamps and a glow over the horizon are left. The
     headlights replace the sun (see night.glsl), so the sun is put at the zenith, out of sight."""
     lamps = lamp_colour(look)
 
@@ -70,7 +70,7 @@ def _by_night(light: Light, look: Lighting) -> Light:
 
 
 def _with_low_sun(light: Light, elevation_deg: float) -> Light:
-    """`light` with a lower sun, which is also redder and dimmer."""
+    """Return `light` with a lower sun, which is also redder and dimmer."""
     elevation = min(math.radians(elevation_deg), light.sun_elevation)
     clear = math.sin(elevation) / math.sin(max(light.sun_elevation, elevation))
     red, green, blue = light.sun
