@@ -1,6 +1,6 @@
 """The `simulator` command: tracks, centre lines, rendered views, the link server, the live view.
 
-|simulator tracks --json
+simulator tracks --json
 simulator tracks plot forza --out forza.png
 simulator centreline forza --step 1 --out forza.csv
 simulator snapshot mountain-pass --out sheet.png --lanes 2

@@ -1,6 +1,6 @@
 """Writes a contact sheet of a road: driver views along it, with the true markings drawn over them.
 
-|simulator snapshot TRACK --out sheet.png --view chase --kind class --light rain
+simulator snapshot TRACK --out sheet.png --view chase --kind class --light rain
 """
 
 from dataclasses import dataclass, replace

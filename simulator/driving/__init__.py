@@ -1,1 +1,1 @@
-"""Driving without an operator: speed control and the steering law of scripted cars."""
+"""Speed control and steering law of the scripted drivers."""

@@ -1,4 +1,5 @@
-"""Built-in driver: keeps its lane, slows down for bends, and keeps its distance to the car ahead.
+"""A scripted driver that keeps its lane, slows down for bends, and keeps its distance to the car
+ahead.
 
 `lateral_law` computes the steering, `speed.SpeedControl` the pedals. Track frame, left positive.
 """
@@ -19,7 +20,7 @@ DAMPING: Final = 0.9
 
 
 class Cruise:
-    """Drives on `road` at up to `speed_kmh`, in the lane nearest to the car when it takes over."""
+    """Drives on `road` at up to `speed_kmh`, in the lane that is nearest at the first command."""
 
     def __init__(
         self,
@@ -38,12 +39,12 @@ class Cruise:
         self._lane: int | None = None
 
     def take_over(self) -> None:
-        """Start again: the next command chooses the lane nearest to the car."""
+        """Reset the driver: the next command selects the lane nearest to the car."""
         self._lane = None
         self._speed_control.reset()
 
     def command(self, state: CarState, traffic: Traffic) -> Command:
-        """The command for one control step."""
+        """Return the command for one control step."""
         road = self._road
         if self._lane is None:
             self._lane = tf.lane_index(state.to_middle, road.lanes, road.lane_width)

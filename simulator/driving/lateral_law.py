@@ -1,8 +1,9 @@
 """The steering law of the scripted drivers: state feedback with curvature feed-forward.
 
-Source: Rajamani, Vehicle Dynamics and Control, 2.5 (bicycle model). Feedback on lateral offset,
-heading and yaw rate. The gains fall with speed, so that the closed loop keeps its natural frequency
-and damping. Track frame, SI units, left positive; `angle` is track tangent minus yaw.
+Source: Rajamani, Vehicle Dynamics and Control, 2.5 (bicycle model). The feedback is on lateral
+offset, heading and yaw rate. The gains decrease with speed, so that natural frequency and damping
+of the closed loop are constant. Track frame, SI units, left positive; `angle` is track tangent
+minus yaw.
 """
 
 from typing import Final
@@ -13,19 +14,19 @@ from simulator.vehicle.state import CarState
 from simulator.vehicle.surface import SURFACES
 
 YAW_RATE_GAIN: Final = 0.08  # s
-MIN_SPEED: Final = 5.0  # m/s: below it, the gains would grow without bound
-PREVIEW_S: Final = 0.12  # about the delay of the steering rate and the control step together
-MAX_OFFSET_ERROR: Final = 1.5  # m: larger errors are clipped to it
-MIN_RADIUS_FACTOR: Final = 0.3  # bounds the curvature inside of tight bends
+MIN_SPEED: Final = 5.0  # m/s: bounds the gains, which grow as the speed decreases
+PREVIEW_S: Final = 0.12  # about the sum of the delays of steering rate and control step
+MAX_OFFSET_ERROR: Final = 1.5  # m: larger errors are clipped to this value
+MIN_RADIUS_FACTOR: Final = 0.3  # bounds the curvature of the path on the inside of tight bends
 
 
 class LateralLaw:
-    """Stateless law that computes the steering commands for one car on one road."""
+    """Computes steering commands for one car on one road; it has no state."""
 
     def __init__(
         self, car: CarParameters, road: Road, *, natural_frequency: float, damping: float
     ) -> None:
-        """`natural_frequency` (rad/s) and `damping` of the lateral motion."""
+        """`natural_frequency` (rad/s) and `damping` ratio of the controlled lateral motion."""
         self._car = car
         self._track = road.track
         self._rear_stiffness = car.cornering_stiffness(False, SURFACES[road.track.surface].grip)
@@ -33,19 +34,19 @@ class LateralLaw:
         self._damping = damping
 
     def road_curvature(self, state: CarState) -> float:
-        """Curvature (1/m) of the car's path along the road, `PREVIEW_S` ahead."""
+        """Return the curvature (1/m) of the car's path parallel to the road, `PREVIEW_S` ahead."""
         curvature = self._track.curvature(state.s + feedback_speed(state) * PREVIEW_S)
         return float(curvature / max(1.0 - curvature * state.to_middle, MIN_RADIUS_FACTOR))
 
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
-        """Steering command in [-1, 1], left positive.
+        """Return the steering command in [-1, 1], left positive, to follow a path.
 
-        The path is at `offset` (m from the track's centre), has `curvature` (1/m) and an angle of
-        `path_angle` (rad) to the road.
+        The path is at `offset` (m from the track's centre), has the curvature `curvature` (1/m) and
+        the angle `path_angle` (rad) to the road.
         """
-        # Recorded datasets depend on every bit of this: keep the order of the operations.
+        # Recorded datasets depend on every bit of the result, so keep the order of the operations.
         car, v = self._car, feedback_speed(state)
         # Body slip angle at the centre of gravity in a steady turn (Rajamani, 3.3).
         mass_term = car.total_mass * car.front_axle * v * v / car.wheelbase
@@ -64,9 +65,9 @@ class LateralLaw:
         return min(max(wheel_angle / car.steering_lock, -1.0), 1.0)
 
     def restart(self) -> None:
-        """Do nothing: the law has no state to forget."""
+        """Do nothing: the law has no state to reset."""
 
 
 def feedback_speed(state: CarState) -> float:
-    """Speed (m/s) for which gains and preview are computed."""
+    """Return the speed (m/s), at least MIN_SPEED, for which gains and preview are computed."""
     return max(state.speed, MIN_SPEED)

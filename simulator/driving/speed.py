@@ -1,4 +1,5 @@
-"""Speed of the scripted drivers: a speed profile of the track, and throttle, brake and gear.
+"""Computes the speed of the scripted drivers: a speed profile of the track, and throttle, brake,
+gear.
 
 SI units.
 """
@@ -28,40 +29,41 @@ INTEGRAL_LIMIT = 1.0  # m/s2
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Speed limit (m/s) in cells along the lap, which allows for the bends and for braking before
+    """Speed limits (m/s) of cells along the lap, from the bends and the braking distance before
     them."""
 
     limit: NDArray[np.float64]
     cell_m: float
 
     def at(self, s: float) -> float:
-        """Limit (m/s) at `s` (m); laps repeat."""
+        """Return the limit (m/s) at `s` (m); the profile repeats every lap."""
         return float(self.limit[int(s / self.cell_m) % len(self.limit)])
 
 
 def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProfile:
-    """Limits up to `desired` (m/s); bends are driven up to `innermost_y` (m) inside the centre."""
+    """Compute the profile with limits of at most `desired` (m/s). `innermost_y` (m) is the largest
+    offset to the inside of the centre line at which bends are driven."""
     bends = bend_profile(track, innermost_y)
     return SpeedProfile(np.minimum(bends.limit, desired), bends.cell_m)
 
 
 def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
-    """The speed profile without a desired speed: only bends, and braking before them, limit the
-    speed. `innermost_y` as for `speed_profile`."""
+    """Compute the profile that allows for bends and braking before them only, without a desired
+    speed. `innermost_y` (m) as in `speed_profile`."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)
     bend = bend / np.maximum(1.0 - bend * innermost_y, 0.3)
     squared = np.tile(LATERAL_ACCELERATION / np.maximum(bend, 1e-6), 2)
-    # v^2 can fall by 2 * BRAKING per metre; the most restrictive bend ahead decides. Two laps,
-    # because the end of a lap brakes for the bends at its start.
+    # v^2 can decrease by 2 * BRAKING per metre; the most restrictive bend ahead decides. Two laps
+    # are computed, because the car brakes at the end of a lap for the bends at its start.
     drop = 2.0 * BRAKING * cell * np.arange(2 * cells)
     allowed = np.minimum.accumulate((squared + drop)[::-1])[::-1] - drop
     return SpeedProfile(np.sqrt(allowed[:cells]), cell)
 
 
 class Pedals:
-    """Converts an acceleration into throttle, brake and gear by the inverse model of the car."""
+    """Converts an acceleration into throttle, brake and gear with an inverse model of the car."""
 
     def __init__(self, car: CarParameters) -> None:
         self._car = car
@@ -75,9 +77,11 @@ class Pedals:
     def press(
         self, acceleration: float, speed: float, error: float, slope: float, dt: float
     ) -> tuple[float, float, int]:
-        """Throttle, brake, gear for `acceleration` (m/s2) on a road of `slope` (rise per m).
+        """Return throttle, brake (0 to 1) and gear for `acceleration` (m/s2) at `speed` (m/s) on a
+        road with `slope` (rise per m).
 
-        The integral of `error` (target minus actual speed, m/s) trims errors of the model.
+        The integral of `error` (target minus actual speed, m/s) compensates errors of the model.
+        `dt` is the time since the last call (s).
         """
         car = self._car
         step = INTEGRAL_GAIN * error * dt
@@ -87,7 +91,7 @@ class Pedals:
         gear = self._choose_gear(speed)
         if force < 0.0:
             return 0.0, min(-force * car.wheel_radius / car.brake_torque, 1.0), gear
-        # Engine braking acts at a closed throttle and has to be overcome first: see the powertrain.
+        # The throttle must first overcome the engine braking at closed throttle; see `powertrain`.
         braking = self._engine_braking(speed, gear)
         throttle = (force / self._full_throttle_force(speed, gear) + braking) / (1.0 + braking)
         return min(throttle, MAX_THROTTLE), 0.0, gear
@@ -106,13 +110,13 @@ class Pedals:
         return self._car.gears[gear - 1] * self._car.final_drive
 
     def _engine_braking(self, speed: float, gear: int) -> float:
-        """Engine braking torque at a closed throttle, as a share of the full-load torque."""
+        """Return the engine's braking torque at closed throttle, as a share of full-load torque."""
         car = self._car
         above = max(self._rpm(speed, gear) - car.idle_rpm, 0.0)
         return car.engine_braking * above / (car.top_rpm - car.idle_rpm)
 
     def _full_throttle_force(self, speed: float, gear: int) -> float:
-        """Driving force (N) at full throttle."""
+        """Return the driving force (N) at full throttle at `speed` (m/s)."""
         car = self._car
         rpm = max(self._rpm(speed, gear), car.idle_rpm)
         torque = float(np.interp(rpm, np.arange(len(car.torque)) * 1000.0, car.torque))
@@ -120,14 +124,14 @@ class Pedals:
 
 
 class TargetSpeed:
-    """Throttle, brake and gear that reach a speed and keep the distance to a leader."""
+    """Computes throttle, brake and gear that reach a speed and keep the distance to a leader."""
 
     def __init__(self, car: CarParameters, step_s: float) -> None:
-        """`step_s` is the time between two commands."""
+        """`step_s` is the time between two commands (s)."""
         self._pedals = Pedals(car)
         self._step_s = step_s
         self.following = False
-        """Whether the last command kept the distance to a leader."""
+        """Whether the distance to a leader limited the acceleration of the last command."""
 
     def reset(self) -> None:
         self._pedals.reset()
@@ -135,15 +139,15 @@ class TargetSpeed:
     def command(
         self, state: CarState, traffic: Traffic, target: float, slope: float
     ) -> tuple[float, float, int]:
-        """Throttle, brake, gear for one control step towards `target` (m/s) on a road of `slope`
-        (rise per m)."""
+        """Return throttle, brake and gear for one control step towards `target` (m/s) on a road
+        with `slope` (rise per m)."""
         speed = max(state.speed, 0.0)
         follow = inf
         leader = traffic.leader(state.s, state.to_middle) if traffic.count else None
         if leader is not None:
             follow = float(idm_acceleration(leader[0], speed, leader[1], max(target, 1.0)))
         acceleration = target_acceleration(speed, target, follow)
-        # The integral is for a free road: behind a car, the target speed is not reached on purpose.
+        # Behind a leader no error is integrated: the car is slower than the target on purpose.
         self.following = follow <= acceleration
         error = 0.0 if self.following else target - speed
         error = error if abs(error) < BRAKING else 0.0
@@ -151,12 +155,12 @@ class TargetSpeed:
 
 
 class SpeedControl:
-    """`TargetSpeed` along a speed profile."""
+    """Applies `TargetSpeed` to a speed profile of the track."""
 
     def __init__(
         self, profile: SpeedProfile, track: Track, car: CarParameters, step_s: float
     ) -> None:
-        """`step_s` is the time between two commands."""
+        """`step_s` is the time between two commands (s)."""
         self._profile = profile
         self._track = track
         self._follower = TargetSpeed(car, step_s)
@@ -165,16 +169,17 @@ class SpeedControl:
         self._follower.reset()
 
     def command(self, state: CarState, traffic: Traffic) -> tuple[float, float, int]:
-        """Throttle, brake, gear for one control step."""
+        """Return throttle, brake and gear for one control step."""
         target = self._profile.at(state.s + PREVIEW_S * max(state.speed, 0.0))
         slope = float(self._track.slope(state.s))
         return self._follower.command(state, traffic, target, slope)
 
 
 def target_acceleration(speed: float, target: float, follow: float = inf) -> float:
-    """Comfortable acceleration (m/s2) towards `target` (m/s), at most `follow`.
+    """Return a comfortable acceleration (m/s2) from `speed` towards `target` (m/s), at most
+    `follow`.
 
-    `follow` is the acceleration that the car ahead allows.
+    `follow` (m/s2) is the acceleration that the distance to the car ahead allows.
     """
     free = min(max(1.2 * (target - speed), -BRAKING * 1.6), 2.0)
     return min(free, follow)

@@ -6,17 +6,17 @@
     gymnasium.make("driverview/LateralControl-v0", track="circuit", lanes=1, frequency_hz=20)
     gymnasium.make("driverview/DriverView-v0", track="forza", views=("front", "rear"))
 
-many cars in one compiled call (`simulator.env.vector`)
+many cars in one compiled call (see `simulator.env.vector`):
 
     gymnasium.make_vec("driverview/LateralControl-v0", 256, "vector_entry_point", track="random")
 
-or, without the second import, by Gymnasium's own syntax for names that a module registers:
+or without the second import, in Gymnasium's syntax for names that a module registers:
 
     gymnasium.make("simulator.env:driverview/LateralControl-v0")
 
-An episode starts 25 m before the line, at rest, unless `reset(options={"s", "to_middle", "angle",
-"speed"})` sets another start. It terminates off the track, backwards or in a collision, and is
-truncated after 6500 steps (`max_episode_steps` of `gymnasium.make`).
+An episode starts 25 m before the start line, at rest, unless the options of `reset` set "s",
+"to_middle", "angle" or "speed". It terminates when the car leaves the track, drives backwards or
+collides. It is truncated after 6500 steps (`max_episode_steps` of `gymnasium.make`).
 """
 
 from collections.abc import Mapping
@@ -44,17 +44,17 @@ RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
 
 
 class LateralControl(gym.Env[Any, Any]):
-    """Keep the car in the middle of the track, from its state.
+    """Keep the car in the middle of the track: an environment that observes the car's state.
 
-    Observation (7,) float32: to_middle/w, angle/pi, v_x and v_y over 75 km/h, heading class
-    one-hot (left, straight, right). Action: steering in [-1, 1], left positive.
+    Observation (7,) float32: to_middle/w, angle/pi, v_x and v_y divided by 75 km/h, class of the
+    road one-hot (left, straight, right). Action: steering in [-1, 1], left positive.
 
     Keyword arguments are the fields of DriveOptions, EpisodeOptions, ObservationOptions and
     RenderOptions, and `render_mode` ("rgb_array" or None). Raises UserError for options or actions
-    out of their ranges, ResetNeeded for a step before a reset or after the end of an episode.
+    out of their ranges, and ResetNeeded for a step before a reset or after the end of an episode.
     """
 
-    # Gymnasium types it as an instance attribute, but reads it from the class.
+    # Gymnasium declares it as an instance attribute, but reads it from the class.
     metadata: dict[str, Any] = RENDERING
     kind: ClassVar[Kind] = "state"
 
@@ -94,7 +94,7 @@ class LateralControl(gym.Env[Any, Any]):
 
     @property
     def world(self) -> World:
-        """The world of the present episode."""
+        """The world of the current episode."""
         return self._cars.world(0)
 
     def reset(
@@ -128,13 +128,14 @@ class LateralControl(gym.Env[Any, Any]):
         return observation, float(self._cars.results[0, REWARD]), ended, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """`render_view` (H, W, 3) with `render_mode="rgb_array"`, else None."""
+        """Return the picture (H, W, 3) of `render_view`, or None without a `render_mode`."""
         if self.render_mode is None:
             return None
         return self._renderer.render(self.world, (self._render_view,))[self._render_view]
 
     def calibration(self) -> dict[str, NDArray[np.float64]]:
-        """`intrinsics` (3, 3) in pixels, and each view's `Camera.extrinsics` (4, 4) by its name."""
+        """Return `intrinsics` (3, 3) in px, and each view's `Camera.extrinsics` (4, 4) by its
+        name."""
         return self._renderer.calibration(self._observer.views or (self._render_view,))
 
     def close(self) -> None:
@@ -170,7 +171,7 @@ class LateralControl(gym.Env[Any, Any]):
 
 
 class DriverView(LateralControl):
-    """Keep the car in the middle of the track, from the driver's camera view.
+    """Keep the car in the middle of the track: an environment that observes the driver's view.
 
     Observation: {"image": (height, width, 3) uint8 RGB, "state": (7,) as in LateralControl}.
     """

@@ -1,4 +1,4 @@
-"""Actions of the environments: the steering alone, or the paper's four commands."""
+"""Actions of the environments: steering only, or steering, throttle, brake and gear."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +17,7 @@ from trackfeatures.errors import UserError
 Controls = Literal["steer", "full"]
 
 THROTTLE, GEAR = 0.2, 1
-"""Throttle and gear that are held while only the steering is controlled, as in the paper."""
+"""Constant throttle and gear while only the steering is controlled; values of the paper."""
 
 LIMITS = {
     "steer": (-1.0, 1.0),
@@ -35,15 +35,15 @@ def check_controls(controls: str) -> None:
 
 
 def action_space(controls: Controls) -> gym.spaces.Box:
-    """The space of actions, float32: shape (1,) for steering, or (4,) for steering, throttle, brake
-    and gear."""
+    """Return the action space, float32: shape (1,) for steering, or (4,) for steering, throttle,
+    brake and gear."""
     low, high = zip(*(LIMITS[name] for name in NAMES[controls]), strict=True)
     return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
 
 def to_command(action: Any, controls: Controls) -> Command:
-    """The command for `action`; the gear is rounded. Values that exceed their bounds by the
-    rounding of float32 are clipped. Raises UserError for values further outside the space."""
+    """Convert `action` (1,) or (4,) to a command; the gear is rounded. Values beyond their bounds
+    by no more than float32 rounding are clipped. Raises UserError for values farther outside."""
     names = NAMES[controls]
     values = _numbers("action", action)
     if values.shape != (len(names),):
@@ -63,8 +63,8 @@ def to_command(action: Any, controls: Controls) -> Command:
 
 
 def to_rows(actions: Any, controls: Controls, moving: NDArray[np.bool_]) -> FloatArray:
-    """Steer, throttle, brake and gear (N, 4) of the cars that are `moving` (N,), as `to_command`
-    makes them from each of `actions` (N, k). Raises UserError that names the car."""
+    """Convert `actions` (N, k) to rows of steer, throttle, brake and gear (N, 4), as `to_command`
+    does. Checks only the cars that are `moving` (N,). Raises UserError, which names the car."""
     names = NAMES[controls]
     values = _numbers("actions", actions)
     if values.shape != (len(moving), len(names)):
@@ -87,7 +87,7 @@ def to_rows(actions: Any, controls: Controls, moving: NDArray[np.bool_]) -> Floa
 
 @contextmanager
 def naming_car(number: int, count: int) -> Iterator[None]:
-    """Put the number of the car before the message of an error, if there are several cars."""
+    """Prefix the message of a UserError with the number of the car, if there are several cars."""
     try:
         yield
     except UserError as error:

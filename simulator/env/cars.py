@@ -1,4 +1,4 @@
-"""The cars of an environment: one compiled call steps all of them, on one or more threads."""
+"""The cars of an environment. One compiled call steps all of them, on one or more threads."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -33,15 +33,15 @@ from trackfeatures.definitions import MARKINGS
 from trackfeatures.state_vector import STATE_SIZE
 
 FEATURES = (*MARKINGS, "to_lane_centre")
-"""The features of `results` from DISTANCES_AT on."""
+"""Names of the features in the columns of `results` from DISTANCES_AT on."""
 
 
 class Cars:
-    """One car for each of `options`, and the outputs of their last control step.
+    """One car for each entry of `options`, and the outputs of the cars' last control step.
 
-    noise: standard deviation on the states; limit: their bound; beams: whether the range beams are
-    computed; threads: on how many threads the cars are stepped. The outputs do not depend on the
-    number of cars or threads.
+    noise: standard deviation of the noise on the states; limit: bound of the states; beams: whether
+    the range beams are computed; threads: number of threads that step the cars. The outputs do not
+    depend on the number of cars or threads.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class Cars:
         return self.drives[number].world
 
     def beams_of(self, number: int) -> FloatArray | None:
-        """The range beams (19,) of a car in m, None if they are not computed."""
+        """Return the range beams (19,) of a car in m; None if they are not computed."""
         return self.beams[number] if self.beams.size else None
 
     def reset(self, number: int, rng: np.random.Generator, start: Mapping[str, Any]) -> int:
-        """Begin an episode of a car; returns its seed."""
+        """Begin an episode of a car at `start` (options of `reset`); returns the episode's seed."""
         seed = self.drives[number].reset(rng, start)
         self._draw_noise(number, rng)
         observe_cars(number, number + 1, self.fleet.arrays, self._outputs, self._rules, True)
@@ -97,8 +97,8 @@ class Cars:
         rngs: Sequence[np.random.Generator],
         moving: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Advance the cars that are `moving` (N,), by default all, by a control step under the
-        commands in their rows."""
+        """Advance the cars that are `moving` (N,), by default all, by one control step with the
+        commands in their rows of the fleet."""
         moving = self._everyone if moving is None else moving
         rows = self.fleet.cars
         rows[:, TOUCHED], rows[:, DONE], rows[:, SKIPPED] = 0.0, 0.0, ~moving
@@ -121,12 +121,13 @@ class Cars:
                     self._reward(number)
 
     def ending(self, number: int) -> Ending | None:
-        """Why the episode of a car has ended; None if it goes on."""
+        """Return the event that ended the episode of a car; None if the episode continues."""
         code = int(self.results[number, ENDED])
         return ENDINGS[code - 1] if code else None
 
     def features(self, number: int) -> dict[str, float]:
-        """The features that are present; Gymnasium's vectors expect absent ones to be left out."""
+        """Return a car's present features by name; Gymnasium requires that absent ones be
+        omitted."""
         row = self.results[number].tolist()
         found = dict(zip(FEATURES, row[DISTANCES_AT : TO_LANE_CENTRE + 1], strict=True))
         present = {name: value for name, value in found.items() if value == value}
@@ -151,7 +152,7 @@ class Cars:
 
 
 class _Threads:
-    """Runs a compiled function over parts of the cars, one part per thread."""
+    """Runs a compiled function on several threads, each on a part of the cars."""
 
     def __init__(self, count: int) -> None:
         self._count = max(count, 1)
@@ -159,7 +160,7 @@ class _Threads:
         self._owner = 0
 
     def run(self, function: Callable[..., None], cars: int, *arguments: Any) -> None:
-        """Call `function(begin, end, *arguments)` for the parts of `cars` cars."""
+        """Call `function(begin, end, *arguments)` for consecutive parts of `cars` cars."""
         if self._count == 1:
             function(0, cars, *arguments)
             return

@@ -1,6 +1,5 @@
-"""One control step of an environment's cars, compiled: physics, track features, range beams, reward
-and ending, over the rows of a fleet. SI units, track frame.
-"""
+"""One control step of an environment's cars in compiled code: physics, track features, range beams,
+reward and ending, for the rows of a fleet. SI units, track frame."""
 
 import math
 from typing import Any
@@ -58,25 +57,25 @@ for function in (
 ):
     callable_from_compiled(function)
 
-# A row of `results` (RESULT,): reward; one more than the index of the ending, 0 for none; sum of
-# the rewards; the five distances and the offset from the lane's centre, NaN for an absent one; the
-# class of the road.
+# Columns of a row of `results` (RESULT,): reward; 1 + index of the ending, 0 for none; sum of the
+# rewards; the five distances and the offset from the lane's centre (m), NaN if absent; class of the
+# road.
 REWARD, ENDED, SCORE, DISTANCES_AT, TO_LANE_CENTRE, HEADING, RESULT = 0, 1, 2, 3, 8, 9, 10
 
 Outputs = tuple[NDArray[np.float32], FloatArray, FloatArray, FloatArray]
-"""States (N, STATE_SIZE), results (N, RESULT), range beams (N, B) in m, and noise to add to the
-states (N, STATE_SIZE), or (N, 0) for none."""
+"""States (N, STATE_SIZE), results (N, RESULT), range beams (N, B) in m, and the noise to add to the
+states, (N, STATE_SIZE) or (N, 0)."""
 Rules = tuple[int, bool, float, float, FloatArray]
 """`ends_code` of the events that end an episode; whether the reward is `step_reward`; its weight
-lambda; bound of the states; angles (B,) of the beams."""
+lambda; bound of the states; angles (B,) of the beams in rad."""
 
 
 @compiled_for_threads
 def step_cars(
     begin: int, end: int, fleet: Arrays, steps: int, outputs: Outputs, rules: Rules
 ) -> None:
-    """Advance the cars `begin` to `end` - 1 by a control step of `steps` physics steps, and observe
-    the cars that completed it."""
+    """Advance the cars `begin` to `end` - 1 by one control step of `steps` physics steps, and fill
+    the outputs of the cars that completed it."""
     work, lent, filled = make_work(), lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         if advance_car(number, lent, steps, lend_work(work)):
@@ -87,8 +86,8 @@ def step_cars(
 def observe_cars(
     begin: int, end: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool
 ) -> None:
-    """Observe the cars `begin` to `end` - 1: after a step or, with `first`, at the start of an
-    episode."""
+    """Fill the outputs of the cars `begin` to `end` - 1, after a step or, if `first`, at the start
+    of an episode."""
     lent, filled = lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         observe_car(number, lent, filled, rules, first)
@@ -96,14 +95,14 @@ def observe_cars(
 
 @compiled
 def lend_outputs(outputs: Outputs) -> Outputs:
-    """The same arrays without reference counting (`runtime.jit.borrowed`)."""
+    """Return the same arrays without reference counting (`runtime.jit.borrowed`)."""
     states, results, beams, noise = outputs
     return borrowed(states), borrowed(results), borrowed(beams), borrowed(noise)
 
 
 @compiled
 def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool) -> None:
-    """Fill the outputs of one car."""
+    """Fill the outputs of car `number`; `first` as in `observe_cars`."""
     states, results, beams, noise = outputs
     ends, rewarded, weight, limit, angles = rules
     car, result = fleet[0][number], results[number]
@@ -136,7 +135,7 @@ def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, firs
 
 @compiled
 def ending_of(car: FloatArray, road: FloatArray, ends: int) -> int:
-    """`ending_code` of a car's row on the row of its road."""
+    """Return the `ending_code` for a car, from its row and the row of its road in the fleet."""
     track = car[TRACK_AT:]
     return ending_code(
         abs(track[TRACK_OFFSET]) > road[EDGE],
@@ -149,8 +148,8 @@ def ending_of(car: FloatArray, road: FloatArray, ends: int) -> int:
 
 @compiled
 def measure_features(road: FloatArray, offset: float, out: FloatArray) -> None:
-    """Fill `out` (6,): the five distances (m) and the offset from the lane's centre, NaN for an
-    absent one, of a car `offset` m left of the middle of `road` (ROAD_SIZE,)."""
+    """Fill `out` (6,) with the five distances and the offset from the lane's centre, in m, of a car
+    `offset` m left of the middle of `road` (ROAD_SIZE,). Absent values are NaN."""
     lanes, width = int(road[LANES]), road[LANE_WIDTH]
     lines: Any = road[LINES_AT : LINES_AT + 2 * MARKINGS].reshape(MARKINGS, 2)
     ml, mr = in_lane_distances(offset, lanes, width, lines)

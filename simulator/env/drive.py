@@ -1,5 +1,4 @@
-"""The episodes of one car: the road, car and start of each episode are random numbers of the car's
-own generator."""
+"""The episodes of one car. Its random generator determines road, car and start of each episode."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,11 +17,11 @@ from simulator.world.fleet import Fleet
 from simulator.world.world import World, check_place
 
 RANDOM_ROADS = 256
-"""Number of roads of `track="random"`: making one takes some 30 ms, so that each is made once."""
+"""Number of roads of `track="random"`. Each is built only once, because that takes about 30 ms."""
 
 
 class RoadShop:
-    """Makes each road once, for all cars that drive on it."""
+    """Builds each road once, for all cars that drive on it."""
 
     def __init__(self) -> None:
         self._tracks: dict[tuple[str, str | Path | None], Track] = {}
@@ -44,7 +43,7 @@ class RoadShop:
 class Drive:
     """The world of car `number` of `fleet`; `reset` begins an episode.
 
-    A reset that chooses another road or car replaces the object `world`.
+    A reset that selects another road or car replaces the object `world`.
     """
 
     def __init__(self, options: DriveOptions, fleet: Fleet, number: int, roads: RoadShop) -> None:
@@ -58,7 +57,7 @@ class Drive:
         self.world = self._make_world(None)
 
     def reset(self, rng: np.random.Generator, given: Mapping[str, Any]) -> int:
-        """Begin an episode that starts at the `given` options of `reset`; returns its seed."""
+        """Begin an episode with the `given` options of `reset`; returns the episode's seed."""
         start = self.check(given)
         episode = int(rng.integers(2**31))
         if self._draws_road or self._draws_car:
@@ -69,9 +68,9 @@ class Drive:
         return episode
 
     def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The start of an episode with the `given` options of `reset`, before any random choice.
-        Raises UserError for an unknown option, a value that is no number, and a start that is not
-        on the road. The random road of the episode is not known yet and may be narrower."""
+        """Return the start of an episode with the `given` options of `reset`; ranges are not
+        resolved yet. Raises UserError for an unknown option, a value that is no number, or a start
+        off the road. If the episode's road is random, the start is not checked against it."""
         start = {**self._options.start, **given}
         ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
         for end in (0, 1):

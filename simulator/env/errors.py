@@ -1,4 +1,4 @@
-"""Errors of the environments that Gymnasium has classes for."""
+"""Errors of the environments that are also errors of Gymnasium or Python."""
 
 import gymnasium as gym
 
@@ -6,8 +6,8 @@ from trackfeatures.errors import UserError
 
 
 class ResetNeeded(UserError, gym.error.ResetNeeded):
-    """`step` was called before `reset` or after the end of an episode."""
+    """Raised if `step` is called before `reset` or after the end of an episode."""
 
 
 class NotCopyable(UserError, TypeError):
-    """An environment cannot be copied or pickled."""
+    """Raised if an environment is copied or pickled."""

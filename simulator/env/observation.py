@@ -1,4 +1,4 @@
-"""Observations: the paper's state vector, a camera view, or a dict of state, views and sensors."""
+"""Builds observations: state vector, camera view, or a dict of state, views and sensors."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -23,7 +23,7 @@ Observation = dict[str, NDArray[Any]] | NDArray[Any]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 PAPER_STATE_NOISE = 0.05
 STATE_LIMIT = 10.0
-"""Bound of the observation space: ten half widths, 750 km/h; no drive reaches it."""
+"""Bound of the state in its space (ten half widths, 750 km/h), which no drive reaches."""
 STATE, IMAGE = "state", "image"
 
 
@@ -32,21 +32,21 @@ class ObservationOptions:
     """Contents and noise of the observations. Raises UserError for a bad option."""
 
     observation: Kind | None = None
-    """"state": (7,); "image": one view; "dict": the state, each view and each sensor by its name (a
-    single view is named "image"). None: the environment's own kind, or "dict" if `views` or
+    """"state": state (7,). "image": one view. "dict": the state, each view and each sensor by its
+    name; a single view is named "image". None: the environment's own kind, or "dict" if `views` or
     `sensors` are given."""
 
     views: Sequence[str] | None = None
-    """Names of the views; None is the driver's view, if the observation has images."""
+    """Names of the views. None: the driver's view, if the observation contains images."""
 
     sensors: Sequence[str | Sensor] = ()
-    """Sensors by their name in the paper's table, or Sensor objects."""
+    """Sensors, by their name in the paper's table or as Sensor objects."""
 
     noise: float | bool = 0.0
-    """Standard deviation of the noise on the state; True means the paper's 0.05."""
+    """Standard deviation of the noise on the state; True is the paper's value, 0.05."""
 
     sensor_noise: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviation of each sensor's noise, in its unit, by sensor name."""
+    """Standard deviation of the noise of sensors, in each sensor's unit, by sensor name."""
 
     def __post_init__(self) -> None:
         if self.observation is not None and self.observation not in KINDS:
@@ -67,16 +67,17 @@ class ObservationOptions:
 
     @property
     def state_noise(self) -> float:
-        """Standard deviation of the noise on the state."""
+        """Standard deviation of the noise on the state, as a number."""
         return PAPER_STATE_NOISE if self.noise is True else float(self.noise)
 
     @property
     def limit(self) -> float:
-        """Bound of the state; with noise it is wider by ten standard deviations."""
+        """Bound of the state, increased by ten standard deviations of the noise."""
         return STATE_LIMIT * (1.0 + self.state_noise)
 
     def resolved(self, kind: Kind) -> "ObservationOptions":
-        """A copy with `observation` and `views` filled in for an environment of this `kind`.
+        """Return a copy in which `observation` and `views` are set for an environment of this
+        `kind`.
 
         Raises UserError for options that contradict each other.
         """
@@ -97,20 +98,20 @@ class ObservationOptions:
 
 
 class Renderer(Protocol):
-    """Draws views of one car's world."""
+    """An object that draws views of one car's world."""
 
     @property
     def options(self) -> RenderOptions: ...
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Copies of the views of the current state, in the order of `views`."""
+        """Return copies of the views of the current state, in the order of `views`."""
 
 
 class Observer:
     """Builds the observations of one car; `options` must be resolved.
 
-    `beams` (19,): the range meter's distances (m) of the current state; None: they are computed
-    when the sensor is read.
+    `beams` (19,) are the distances (m) of the range meter in the current state. With None they are
+    computed when the sensor is read.
     """
 
     def __init__(
@@ -130,16 +131,16 @@ class Observer:
         self.batched = all(
             sensor.name in from_beams and not sensor.noise for sensor in self.suite.sensors
         )
-        """Whether exact range beams are the only sensors."""
+        """Whether the observation has no sensors other than range meters without noise."""
         self._limit = options.limit
         self.space = self._space()
 
     def restart(self, seed: int) -> None:
-        """Seed the sensors' noise for an episode."""
+        """Seed the noise of the sensors for an episode."""
         self.suite.restart(seed)
 
     def observe(self, world: World, state: NDArray[np.float32]) -> Observation:
-        """The observation of the current state; `state` (7,) is a part of it."""
+        """Return the observation of `world`'s current state, whose state vector is `state` (7,)."""
         if self.kind == "image":
             return self._renderer.render(world, self.views)[self.views[0]]
         if self.kind == "state":
@@ -151,7 +152,7 @@ class Observer:
         return observed | self.read_sensors(world)
 
     def read_sensors(self, world: World) -> dict[str, NDArray[Any]]:
-        """The readings of the current state by the sensors' names."""
+        """Return the readings of all sensors in the current state, by sensor name."""
         return {
             sensor.name: _as_array(reading, sensor.dtype)
             for sensor, reading in zip(
@@ -173,7 +174,7 @@ class Observer:
         return gym.spaces.Dict({STATE: state, **views, **sensors})
 
     def key(self, view: str) -> str:
-        """The name of a view in an observation that is a dict."""
+        """Return the name of a view in an observation of kind "dict"."""
         return IMAGE if len(self.views) == 1 else view
 
     def _replace_camera(self, sensors: Sequence[str | Sensor]) -> list[str | Sensor]:
@@ -188,7 +189,7 @@ class Observer:
 
 
 def read_from_beams(sensor: str | Sensor) -> bool:
-    """Whether a sensor is the range meter, whose beams the control step computes."""
+    """Return whether a sensor is the range meter; the control step computes its beams."""
     return sensor != CAMERA and sensors_of([sensor])[0].read is read_track_range
 
 

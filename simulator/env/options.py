@@ -1,4 +1,4 @@
-"""The options of the environments: the road, its traffic, the car and the controls."""
+"""Options of the environments: road, traffic, car and controls."""
 
 import difflib
 import math
@@ -22,43 +22,43 @@ from simulator.world.control_rate import check_frequency
 from trackfeatures.errors import UserError
 
 Setting = float | tuple[float, float]
-"""A number, or a range (least, greatest) of which each episode gets a random number."""
+"""A number, or a range (least, greatest) from which each episode draws a random number."""
 
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """The road, its traffic, the car and the controls. Raises UserError for a bad option."""
+    """Options for road, traffic, car and controls. Raises UserError for a bad option."""
 
     track: str = "circuit"
-    """A name, a file, or "random": each episode drives on one of 256 random roads."""
+    """Name of a track, a file, or "random": each episode drives on one of 256 random roads."""
 
     lanes: int | tuple[int, int] = 1
     lane_width: Setting | None = None
-    """m; a random number of a range is rounded to 0.1 m. None: 4.0, or the random width of a varied
-    road."""
+    """Width of a lane, m; a random number from a range is rounded to 0.1 m. None: 4.0, or the
+    random width of a varied road."""
     roads: str = "paper"
-    """"varied": lane width, shoulders and lines are random by `road_seed`, the look by
+    """"paper", or "varied": lane width, shoulders and lines are random by `road_seed`, the look by
     `light_seed`."""
     road_seed: int = 0
     traffic: int = 0
-    """Other cars, 0 to 12."""
+    """Number of other cars, 0 to 12."""
 
     friction: Setting = 1.0
     """Factor on the tyres' friction coefficient."""
     mass: Setting = 1.0
-    """Factor on the car's mass, without fuel, and on its inertia."""
+    """Factor on the car's mass without fuel and on its inertia."""
     start: Mapping[str, Setting] = field(default_factory=dict)
-    """Start of each episode, as in `reset(options=...)`, which has priority."""
+    """Start of each episode, as in `reset(options=...)`; options given to `reset` have priority."""
 
     frequency_hz: int = 20
-    """Control steps per second; must divide the physics' 200 Hz."""
+    """Control steps per second; a divisor of 200 Hz, the rate of the physics."""
 
     controls: Controls = "steer"
     """"steer": steering only, at throttle 0.2 in gear 1; "full": steering, throttle, brake and
     gear."""
 
     tracks_dir: str | Path | None = None
-    """A further folder to search for tracks."""
+    """Additional folder in which tracks are searched."""
 
     def __post_init__(self) -> None:
         check_controls(self.controls)
@@ -86,8 +86,8 @@ class DriveOptions:
             ends_of(name, setting)
 
     def car(self, rng: np.random.Generator | None) -> CarParameters:
-        """The car of an episode. Values of ranges are random numbers of `rng`; without `rng` they
-        are the least values."""
+        """Return the car of an episode. Values of ranges are random numbers from `rng`; without
+        `rng` they are the least values."""
         friction, mass = draw(self.friction, rng), draw(self.mass, rng)
         car = CarParameters()
         if friction == mass == 1.0:
@@ -107,7 +107,7 @@ OPTIONS = (DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions)
 def split_options(
     given: dict[str, Any],
 ) -> tuple[DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions]:
-    """The four groups of options from keyword arguments. Raises UserError for an unknown one."""
+    """Split keyword arguments into four groups of options. Raises UserError for unknown names."""
     names = [field.name for group in OPTIONS for field in fields(group)]
     for name in given:
         if name not in names:
@@ -127,15 +127,15 @@ def split_options(
 
 
 def draw(setting: Any, rng: np.random.Generator | None) -> Any:
-    """The number of a setting: the number itself, or a random number of the range (its least value
-    without `rng`)."""
+    """Return the number of a setting: the number itself, or a random number from its range (the
+    least value without `rng`)."""
     if not isinstance(setting, tuple):
         return setting
     return setting[0] if rng is None else float(rng.uniform(*setting))
 
 
 def ends_of(name: str, setting: Any) -> tuple[float, ...]:
-    """The number of a setting, or both ends of its range. Raises UserError for anything else."""
+    """Return both ends of a range; a number is both ends. Raises UserError for anything else."""
     given = setting if isinstance(setting, tuple) else (setting, setting)
     try:
         ends = tuple(float(value) for value in given)

@@ -1,8 +1,8 @@
-"""The reward of a control step, what ends an episode, and the options of both.
+"""The reward of a control step, the events that end an episode, and the options for both.
 
-`step_reward` is the formula of the paper's section on the RL control module, with one difference:
-the paper divides the lateral offset by half the width of the lane, this code by half the width of
-the track. `quadratic_reward` is the paper's second reward.
+`step_reward` is the formula in the paper's section on the RL control module, with one difference:
+the paper divides the lateral offset by half of the lane's width, this code by half of the track's
+width. `quadratic_reward` is the paper's second reward.
 """
 
 import math
@@ -25,16 +25,16 @@ OFF_TRACK_REWARD = -2.0
 STEERING_LOCK = CarParameters.steering_lock
 
 Reward = Callable[[CarState, Road, Ending | None], float]
-"""Reward function of (state after the step, road, why the episode ends or None)."""
+"""A function of the state after the step, the road, and the event that ends the episode or None."""
 
 
 @compiled
 def ending_code(off_track: bool, backwards: bool, wall: bool, touched: bool, ends: int) -> int:
-    """One more than the index into ENDINGS of the event that ends an episode; 0 if it continues.
+    """Return 1 + the index into ENDINGS of the event that ends an episode; 0 if it continues.
 
     wall: the car touches a wall; touched: it touches anything; ends: `ends_code` of the events that
-    end an episode. Contact with a wall counts as "off_track"; if that does not end an episode, as
-    "collision".
+    end an episode. Contact with a wall counts as "off_track", or as "collision" if "off_track" does
+    not end an episode.
     """
     # Walls stand 2.5 m beyond the edge, so the car is off the track before it touches one. The
     # contact counts even if the car is back on the road by the end of the same control step.
@@ -46,7 +46,7 @@ def ending_code(off_track: bool, backwards: bool, wall: bool, touched: bool, end
 
 
 def ends_code(ends: Collection[Ending]) -> int:
-    """A bit mask of the events `ends`: bit k stands for ENDINGS[k]."""
+    """Return a bit mask of the events `ends`: bit k stands for ENDINGS[k]."""
     return sum(1 << k for k, event in enumerate(ENDINGS) if event in ends)
 
 
@@ -54,7 +54,7 @@ ALL_ENDS = ends_code(ENDINGS)
 
 
 def ending(state: CarState, ends: Collection[Ending] = ENDINGS) -> Ending | None:
-    """The event out of `ends` that ends an episode at `state`; None if the episode continues."""
+    """Return the event of `ends` that ends an episode at `state`; None if the episode continues."""
     touched, bits = state.collision, ALL_ENDS if ends is ENDINGS else ends_code(ends)
     code = ending_code(
         state.off_track, state.backwards, touched == "wall", touched is not None, bits
@@ -70,10 +70,10 @@ def step_reward(
     ended: bool,
     weight: float = 1.0,
 ) -> float:
-    """cos(angle) - weight |sin(angle)| - |to_middle| / half_width, or -2 when the episode ends or
-    the car points backwards (|angle| >= pi/2).
+    """Return cos(angle) - weight |sin(angle)| - |to_middle| / half_width, or -2 if the episode ends
+    or the car points backwards (|angle| >= pi/2).
 
-    angle in rad, to_middle and half_width (half of the track's own width) in m; weight is the
+    angle in rad; to_middle and half_width (half of the track's own width) in m; weight is the
     paper's lambda. A score is the sum over a fixed number of steps.
     """
     if ended or abs(angle) >= 0.5 * math.pi:
@@ -83,10 +83,10 @@ def step_reward(
 
 @callable_from_compiled
 def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> float:
-    """-(0.3 offset^2 + angle^2 + 0.03 delta^2), or -2 when the episode ends.
+    """Return -(0.3 offset^2 + angle^2 + 0.03 delta^2), or -2 if the episode ends.
 
-    offset in m from the line to follow, angle in rad, delta the front wheels' angle in rad at the
-    steering action `steer` in [-1, 1].
+    offset in m from the line to follow; angle in rad; delta is the angle of the front wheels in rad
+    for the steering action `steer` in [-1, 1].
     """
     if ended:
         return OFF_TRACK_REWARD
@@ -96,16 +96,16 @@ def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> 
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """Reward and termination of an environment's episodes. Raises UserError for a bad option."""
+    """Reward and termination of the episodes. Raises UserError for a bad option."""
 
     reward: Reward | None = None
-    """`reward(state, road, ending) -> float`; None is `step_reward`."""
+    """A function `reward(state, road, ending) -> float`; None uses `step_reward`."""
 
     lambda_: float = 1.0
     """Weight of |sin(angle)| in `step_reward`."""
 
     ends: Collection[Ending] = ENDINGS
-    """The events that end an episode; after other events it continues."""
+    """Events that end an episode; after other events it continues."""
 
     def __post_init__(self) -> None:
         if self.reward is not None and not callable(self.reward):
@@ -128,7 +128,8 @@ class EpisodeOptions:
             )
 
     def compute_reward(self, state: CarState, road: Road, ended: Ending | None) -> float:
-        """The `reward` of a step that led to `state`. Raises UserError if it is not finite."""
+        """Return the `reward` of a step that led to `state`. Raises UserError unless it is
+        finite."""
         assert self.reward is not None
         reward = float(self.reward(state, road, ended))
         if not math.isfinite(reward):

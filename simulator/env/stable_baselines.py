@@ -1,9 +1,9 @@
-"""A vector environment for Stable-Baselines3, which has a `VecEnv` class of its own.
+"""A vector environment for Stable-Baselines3, which has its own class `VecEnv`.
 
     from simulator.env.stable_baselines import StableBaselinesCars
     PPO("MlpPolicy", StableBaselinesCars(256, track="random", start={"speed": 10.0}))
 
-Needs the package stable-baselines3.
+It requires the package stable-baselines3.
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,10 @@ from simulator.env.vector import LateralControlVector
 
 
 class StableBaselinesCars(VecEnv):
-    """`count` cars of `LateralControlVector(count, **options)`.
+    """A `VecEnv` of the `count` cars of `LateralControlVector(count, **options)`.
 
-    The score and the steps of an episode are in its last info, as `VecMonitor` would put them.
+    The last info of an episode contains its score and number of steps under the keys of
+    `VecMonitor`.
     """
 
     def __init__(self, count: int, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""Where an episode starts: the options of `reset`."""
+"""Checks the start of an episode, which the options of `reset` set."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,17 +12,17 @@ OPTIONS = ("s", "to_middle", "angle", "speed")
 
 
 def reset_options(options: Any) -> dict[str, Any]:
-    """The options given to `reset`. Raises UserError unless they are a dict or None."""
+    """Return the options of `reset` as a dict. Raises UserError unless they are a dict or None."""
     if options is not None and not isinstance(options, Mapping):
         raise UserError(f"options is {options!r}; give a dict, or None")
     return dict(options or {})
 
 
 def check_start(options: Mapping[str, Any], road: Road) -> dict[str, float]:
-    """The arguments of `World.reset` for `options`, as floats; a value that exceeds its bound by
-    the rounding of float32 is clipped. An option that is None is left out.
+    """Convert `options` to the arguments of `World.reset`, as floats. Values beyond their bounds by
+    no more than float32 rounding are clipped; options that are None are left out.
 
-    Raises UserError for an unknown option, and for a value that is not a number.
+    Raises UserError for an unknown option or a value that is not a number.
     """
     unknown = sorted(str(name) for name in options if name not in OPTIONS)
     if unknown:

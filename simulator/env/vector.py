@@ -5,8 +5,8 @@
         track="random", friction=(0.8, 1.2), start={"s": (0.0, 1000.0)},
     )
 
-Each car has the same numbers, bit for bit, as one environment with the car's options and seed.
-Pictures are drawn by worker processes.
+Each car gives the same numbers, bit for bit, as a single environment with its options and seed.
+Worker processes draw the pictures.
 """
 
 import os
@@ -45,26 +45,25 @@ PER_CAR = (
 )
 """Options that may be lists with one entry for each car."""
 CARS_PER_THREAD = 32
-"""Least number of cars for which a thread of their own saves time."""
+"""Least number of cars per thread; with fewer cars an additional thread saves no time."""
 MASK = "reset_mask"
 Seeds = int | Sequence[int | None] | NDArray[np.integer[Any]] | None
-"""One seed, to which each car adds its number, or one for each car."""
+"""One seed, to which each car adds its number, or a list with one seed for each car."""
 Options = TypeVar("Options", DriveOptions, RenderOptions)
 
 
 class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
-    """`num_envs` cars, each as in an environment `LateralControl` of its own.
+    """`num_envs` cars; each behaves like the car of one `LateralControl`.
 
-    Takes the options of `LateralControl`. Each option of PER_CAR, and each number of `start`, is
-    one value for all cars or a list with one entry for each car. An entry that is a tuple (least,
-    greatest) is a range, from which each episode draws a number. `threads`: at most this many
-    threads step the cars; None: one for each core, but at least 32 cars per thread. `workers`:
-    number of processes that draw the pictures, if there are any; None: one for each core.
-    copy=False: the pictures of an observation are the arrays in the memory shared with the workers,
-    which the next `step` or `reset` overwrites.
+    The options are those of `LateralControl`. Each option of PER_CAR, and each entry of `start`, is
+    one value for all cars or a list with one value for each car. A tuple (least, greatest) is a
+    range from which each episode draws a number. `threads`: largest number of threads that step the
+    cars; None: one per core, with at least 32 cars per thread. `workers`: number of processes that
+    draw pictures, if there are any; None: one per core. copy=False: the pictures of an observation
+    are arrays in the memory shared with the workers; the next `step` or `reset` overwrites them.
 
-    Raises UserError for bad options and actions; its message names the car, and no car has moved.
-    Raises PictureWorkerError when a worker dies; `reset` starts new workers.
+    Raises UserError, which names the car, for bad options and actions; then no car has moved.
+    Raises PictureWorkerError if a worker dies; `reset` starts new workers.
     """
 
     kind: ClassVar[Kind] = "state"
@@ -129,12 +128,12 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         self._over = np.zeros(num_envs, np.bool_)
 
     def world(self, number: int) -> World:
-        """The world of the present episode of a car."""
+        """Return the world of the current episode of car `number`."""
         return self._cars.world(number)
 
     @property
     def fleet(self) -> Fleet:
-        """All cars and their roads as arrays, which `step` and `reset` overwrite."""
+        """All cars and their roads as arrays; `step` and `reset` overwrite them."""
         return self._cars.fleet
 
     def reset(
@@ -143,9 +142,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         seed: Seeds = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode of each car, or of each car in the mask `options["reset_mask"]` (N,)
-        bool. The other options are the options of a single environment; each is a number, a list
-        with one for each car, or a range (least, greatest)."""
+        """Begin an episode of each car, or of the cars in the mask `options["reset_mask"]` (N,)
+        bool. The other options are those of a single environment; each is a number, a list with one
+        value for each car, or a range (least, greatest)."""
         if self.closed:
             raise UserError("this environment is closed; make a new one")
         given = reset_options(options)
@@ -166,8 +165,8 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def step(
         self, actions: Any
     ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Advance all cars by a control step; cars whose episode is over are reset according to the
-        autoreset mode."""
+        """Advance all cars by one control step. Cars whose episode has ended are reset according to
+        the autoreset mode."""
         self._check_running()
         moving = ~self._over
         rows = to_rows(actions, self._controls, moving)
@@ -192,7 +191,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         return observed, rewards, terminated, truncated, self._info(everyone) | last
 
     def render(self) -> tuple[Any, ...]:
-        """`render_view` (H, W, 3) of each car with `render_mode="rgb_array"`, else Nones."""
+        """Return each car's `render_view` (H, W, 3), or Nones without a `render_mode`."""
         return self._observer.frames() if self.render_mode else (None,) * self.num_envs
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -212,7 +211,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         self._observer.restart(number, episode)
 
     def _observe(self, chosen: NDArray[np.bool_]) -> Any:
-        """The observations of all cars, after new observations of the `chosen` cars."""
+        """Observe the `chosen` cars (N,) anew; returns the observations of all cars."""
         try:
             return self._observer.observe(chosen)
         except BaseException:  # the cars have moved, but nothing has been returned
@@ -223,7 +222,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         return vector_info(self._cars, self._frequency_hz, chosen)
 
     def _last(self, observed: Any) -> dict[str, Any]:
-        """What Gymnasium's same-step mode adds to `info` for the cars whose episode is over."""
+        """Return what same-step mode adds to `info` for the cars whose episode has ended."""
         observations = np.full(self.num_envs, None, object)
         for number in np.flatnonzero(self._over).tolist():
             observations[number] = (
@@ -284,7 +283,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
 
 
 def _with_lists(shared: Options, listed: dict[str, list[Any]], count: int) -> list[Options]:
-    """The options of each car: `shared`, with its own entry of each list."""
+    """Return the options of each car: `shared`, with the car's entry of each list."""
     options = []
     for number, own in enumerate(_of_each_car(listed, count)):
         with naming_car(number, count):
@@ -299,8 +298,8 @@ def _of_each_car(listed: dict[str, list[Any]], count: int) -> list[dict[str, Any
 def _options_by_car(
     given: dict[str, Any], count: int
 ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-    """The options that are lists with a value for each of `count` cars, and the options with one
-    value for all cars."""
+    """Split options into lists with a value for each of `count` cars, and values shared by all
+    cars."""
     listed, own = _lists({name: given[name] for name in PER_CAR if name in given}, count)
     shared = {name: value for name, value in given.items() if name not in PER_CAR} | own
     if isinstance(shared.get("start"), Mapping):
@@ -312,8 +311,7 @@ def _options_by_car(
 
 
 def _lists(given: dict[str, Any], count: int) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-    """The entries of `given` that are lists with one value for each car, and the entries that are
-    not."""
+    """Split `given` into lists with one value for each car, and values shared by all cars."""
     listed, shared = {}, {}
     for name, value in given.items():
         if isinstance(value, np.ndarray):
@@ -331,7 +329,7 @@ def _lists(given: dict[str, Any], count: int) -> tuple[dict[str, list[Any]], dic
 
 
 class DriverViewVector(LateralControlVector):
-    """`num_envs` cars, each as in an environment `DriverView` of its own."""
+    """`num_envs` cars; each behaves like the car of one `DriverView`."""
 
     kind: ClassVar[Kind] = "dict"
 

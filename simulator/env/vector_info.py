@@ -1,5 +1,5 @@
-"""The `info` of a vector environment, as Gymnasium's vectors build it from the `info` of each
-car."""
+"""Builds the `info` of a vector environment in the form in which Gymnasium combines the cars'
+`info`."""
 
 import math
 from typing import Any
@@ -20,9 +20,9 @@ _ENDINGS = np.array(["", *ENDINGS], object)
 
 
 def vector_info(cars: Cars, frequency_hz: int, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """For each entry of a car's `info` an array (N,), and a boolean array (N,) named with an
-    underscore before the entry's name: whether each car has the entry, that is, whether it is
-    `chosen` (N,)."""
+    """Return an array (N,) for each entry of a car's `info`. For each entry, a boolean array (N,)
+    under the entry's name with a leading underscore marks the cars that have it: the `chosen` cars
+    (N,)."""
     rows, results = cars.fleet.cars, cars.results
     track = rows[:, TRACK_AT:]
     steps = rows[:, STEPS].astype(int)
@@ -64,7 +64,7 @@ def _add(
     present: NDArray[np.bool_],
     everyone: bool,
 ) -> None:
-    """Add a column; 0, or None instead of a string, for cars that do not have it."""
+    """Add a column to `info`. Cars without the entry get 0, or None in a column of strings."""
     absent: Any = None if column.dtype == object else 0
     info[name] = column.copy() if everyone else np.where(present, column, absent)
     info[f"_{name}"] = present.copy()

@@ -15,11 +15,11 @@ from simulator.sensors.standard import CAMERA
 
 
 class VectorObserver:
-    """Builds the observations of `cars`; `options` must be resolved, `pictures` are the options of
-    each car's pictures, drawn by `workers` processes.
+    """Builds the observations of `cars`. `options` must be resolved; `pictures` are the options of
+    each car's pictures, which `workers` processes draw.
 
-    render_view: a further view that `frames` returns, or None. copy: whether pictures are copied
-    out of the shared memory, so that the next step does not change them.
+    render_view: an additional view that `frames` returns, or None. copy: whether pictures are
+    copied out of the shared memory, so that the next step does not change them.
     """
 
     def __init__(
@@ -58,8 +58,7 @@ class VectorObserver:
         self._observers[number].restart(episode)
 
     def observe(self, chosen: NDArray[np.bool_]) -> Any:
-        """The observations of all cars; only the observations of the `chosen` cars (N,) are
-        computed anew."""
+        """Observe the `chosen` cars (N,) anew; returns the observations of all cars."""
         kind: Kind | None = self._first.kind
         if kind == "state":
             return self._cars.states.copy()
@@ -72,13 +71,13 @@ class VectorObserver:
         return {STATE: self._cars.states.copy()} | views | self._read_sensors(numbers)
 
     def frames(self) -> tuple[NDArray[np.uint8], ...]:
-        """The render view of each car."""
+        """Return the picture of the render view of each car."""
         view = str(self._render_view)
         self._pictures.draw((view,), range(len(self._observers)))
         return tuple(self._pictures.of(view).copy())
 
     def close(self) -> None:
-        """End the processes that draw."""
+        """End the processes that draw pictures."""
         self._pictures.close()
 
     def _of(self, view: str) -> NDArray[Any]:
@@ -86,8 +85,8 @@ class VectorObserver:
         return pictures.copy() if self._copy else pictures
 
     def _read_sensors(self, numbers: Sequence[int]) -> dict[str, NDArray[Any]]:
-        """Each sensor's readings (N, ...) of all cars; only the readings of cars `numbers` are
-        computed anew."""
+        """Read the sensors of the cars `numbers` anew; returns the readings (N, ...) of all cars by
+        sensor name."""
         if self._first.batched:
             return {
                 sensor.name: sensor.limit(self._cars.beams).astype(sensor.dtype)

@@ -1,4 +1,4 @@
-"""The pictures of a vector environment's cars, drawn by worker processes into shared memory."""
+"""Draws the pictures of a vector environment's cars with worker processes into shared memory."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -15,8 +15,8 @@ from simulator.world.world import World
 
 
 class VectorPictures:
-    """Draws the `views` of `cars`, each at most once per state; `options`: the picture options of
-    each car."""
+    """Draws the `views` of `cars`, each at most once per state. `options` are the picture options
+    of each car."""
 
     def __init__(
         self, cars: Cars, options: Sequence[RenderOptions], views: Iterable[str], workers: int
@@ -32,10 +32,10 @@ class VectorPictures:
         self.close()
 
     def draw(self, views: Sequence[str], chosen: Iterable[int]) -> None:
-        """Draw the views of the current state of the cars `chosen` that are not drawn yet.
+        """Draw the views of the current states of the `chosen` cars, unless they are drawn already.
 
-        Raises PictureWorkerError when a worker dies; the next `draw` starts new workers. New
-        workers draw all cars: their memory is empty.
+        Raises PictureWorkerError if a worker dies; the next `draw` starts new workers. New workers
+        draw all cars, because their memory is empty.
         """
         if not self._pool.running:
             self.close()
@@ -57,7 +57,7 @@ class VectorPictures:
                 self._drawn[view][number] = self._state(number)
 
     def of(self, view: str) -> NDArray[Any]:
-        """The pictures (N, ...) of `view` in the shared memory; the next `draw` changes them."""
+        """Return the pictures (N, ...) of `view` in shared memory; the next `draw` changes them."""
         return self._pool.pictures(view)
 
     def close(self) -> None:
@@ -77,19 +77,19 @@ class VectorPictures:
 
 
 class CarPictures:
-    """The pictures of one car, for its observer: as `ViewRenderer`."""
+    """The pictures of one car, with the interface of `ViewRenderer`."""
 
     def __init__(self, pictures: VectorPictures, number: int, options: RenderOptions) -> None:
         self._pictures, self._number, self.options = pictures, number, options
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[np.generic]]:
-        """Copies of the views of the car's current state."""
+        """Return copies of the views of the car's current state, by name."""
         self._pictures.draw(views, (self._number,))
         return {view: self._pictures.of(view)[self._number].copy() for view in views}
 
 
 def checked_workers(workers: Any, cars: int) -> int:
-    """The number of processes for an option `workers`; None: one for each core."""
+    """Return the number of processes for the option `workers`; None means one per core."""
     if workers is None:
         workers = len(os.sched_getaffinity(0))
     return min(check_whole("workers", workers, 1), cars)

@@ -1,5 +1,5 @@
-"""Renders an environment's views with one camera, built on first use; each view at most once per
-step."""
+"""Renders the views of an environment with one camera, built at first use; each view at most once
+per step."""
 
 import weakref
 from collections.abc import Sequence
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Rendering of an environment's views; scenery and light depend on `light_seed` only."""
+    """Options for rendering the views. Scenery and light depend only on `light_seed`."""
 
     width: int = 280
     height: int = 210
     light: str = "clear"
-    """Name of a light and weather condition."""
+    """Kind of light and weather, one of `simulator.camera.KINDS`."""
 
     light_seed: int = 0
     mount: CameraParameters | None = None
-    """Position, pitch and field of view of the driver camera; its image size is `width` x `height`.
-    None: the default position."""
+    """Position, angles and lens of the driver camera; its image size is set to `width` x `height`.
+    None: the default camera."""
 
     render_view: str = "front"
-    """The view that `render()` returns, in colour."""
+    """Name of the view that `render()` returns, in colour."""
 
     def __post_init__(self) -> None:
         from simulator.camera import VIEWS, check_light, check_size
@@ -61,11 +61,11 @@ class RenderOptions:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(height, width, 3) of an image in colour."""
+        """Shape (height, width, 3) of a colour image."""
         return self.height, self.width, 3
 
     def space(self, view: str) -> gym.spaces.Box:
-        """The observation space of `view`. Raises UserError for an unknown view."""
+        """Return the observation space of `view`. Raises UserError for an unknown view."""
         from simulator.camera.core.optics import FAR_M
         from simulator.camera.core.render_modes import CLASS, CLASSES, DEPTH, ViewRequest
 
@@ -88,16 +88,16 @@ class ViewRenderer:
         self._images: dict[str, NDArray[Any]] = {}
 
     def change_road(self, road: Road) -> None:
-        """Render views of another road from now on."""
+        """Render views of `road` from now on."""
         if road is not self._road:
             self.close()
             self._road = road
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Copies of the views of the current state, in the order of `views`.
+        """Return copies of the views of the current state, in the order of `views`.
 
-        Returns the images of `Camera.render_views`, except that the depth of the sky is the bound
-        of the space, 6000 m.
+        They are the images of `Camera.render_views`, except that the depth of the sky is FAR_M
+        (6000 m), the bound of the observation space.
         """
         if world.state is not self._rendered_state:
             self._rendered_state, self._images = world.state, {}
@@ -115,8 +115,8 @@ class ViewRenderer:
         return {view: bounded(image) for view, image in images.items()}
 
     def calibration(self, views: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """`intrinsics` (3, 3) in pixels, and by each view's name its extrinsics (4, 4), from the
-        body frame to the camera's; see `Camera.extrinsics`. Draws nothing."""
+        """Return `intrinsics` (3, 3) in pixels and, by view name, the extrinsics (4, 4) from body
+        to camera frame; see `Camera.extrinsics`. Nothing is drawn."""
         from simulator.camera.core.optics import extrinsics
         from simulator.camera.core.render_modes import ViewRequest
 
@@ -127,7 +127,7 @@ class ViewRenderer:
 
     @property
     def camera(self) -> "Camera":
-        """The camera, built on first use: building the scenery takes seconds."""
+        """The camera. It is built at first use, because building the scenery takes seconds."""
         if self._camera is None:
             from simulator.camera import open_camera  # loads the renderer only when it is needed
 

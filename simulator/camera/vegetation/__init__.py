@@ -1,1 +1,1 @@
-"""Trees: where they stand, their textures and how they are drawn."""
+"""Trees: their positions, their textures and how they are drawn."""

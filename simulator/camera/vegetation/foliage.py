@@ -1,4 +1,5 @@
-"""Tree textures, made once per process: an atlas of cells, sqrt-coded colour and alpha; outlines.
+"""Paints the tree textures once per process: an atlas of square cells, one for each kind of tree,
+with sqrt-coded colour and alpha. Also computes the outlines of the trees.
 
 Frame of an outline: x from -0.5 to 0.5, y from 0 (foot) to 1, as in tree.vert.glsl.
 """
@@ -14,24 +15,24 @@ from simulator.arrays import FloatArray
 CELL = 128
 COLUMNS, ROWS = 4, 2
 KINDS: tuple[str, ...] = ("oak", "poplar", "pine", "fir", "palm", "bush", "crown", "birch")
-"""Cell of each kind, row by row; `crown` is any tree from above."""
+"""Kinds of trees in the order of their cells, row by row; `crown` is any tree seen from above."""
 ASPECT = {
     "oak": 0.95, "poplar": 0.36, "pine": 0.62, "fir": 0.5, "palm": 0.8, "bush": 1.5, "birch": 0.6,
 }  # fmt: skip
-"""Width over height of a tree of each kind."""
+"""Width divided by height of a tree of each kind."""
 
 _FINE = 2
-"""Supersampling factor of the cells, for soft edges."""
+"""Supersampling factor of the cells; it gives soft edges."""
 _BARK = np.array([70.0, 55.0, 42.0])
 CORNERS = 6
 _BLEED = 4
-"""Texels by which mipmaps spread the alpha; the outline keeps this margin."""
+"""Number of texels by which mipmaps spread the alpha; the outline keeps this margin."""
 Canvas = NDArray[np.float32]
 
 
 @cache
 def atlas() -> NDArray[np.uint8]:
-    """The atlas (ROWS * CELL, COLUMNS * CELL, 4); row 0 is the top of the first cells."""
+    """Paint the atlas (ROWS * CELL, COLUMNS * CELL, 4) uint8 RGBA; row 0 is the top row."""
     rng = np.random.default_rng(77)
     painters = {
         "oak": _oak, "poplar": _poplar, "pine": _pine, "fir": _fir,
@@ -48,19 +49,20 @@ def atlas() -> NDArray[np.uint8]:
 
 
 def silhouettes() -> NDArray[np.uint8]:
-    """Outlines (kinds, CELL, CELL) of the trees, 255 where no light passes."""
+    """Return the alpha (kinds, CELL, CELL) uint8 of the trees; 255 is opaque."""
     alpha = atlas()[..., 3].reshape(ROWS, CELL, COLUMNS, CELL).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(alpha.reshape(-1, CELL, CELL))
 
 
 @cache
 def outlines() -> FloatArray:
-    """Polygons (kinds, CORNERS, 2) round the pictures of the trees; see `outline`."""
+    """Return polygons (kinds, CORNERS, 2) round the pictures of the trees; see `outline`."""
     return np.stack([outline(shape) for shape in silhouettes()])
 
 
 def _finished(canvas: Canvas) -> NDArray[np.uint8]:
-    """The canvas averaged to cell size, with the leaf colour extended under the transparent rim."""
+    """Return the cell (CELL, CELL, 4) uint8: `canvas` averaged to cell size, with the leaf colour
+    extended into transparent texels, so that filtered edges keep it."""
     alpha = canvas[..., 3:]
     premultiplied = np.concatenate([canvas[..., :3] * alpha, alpha], axis=-1)
     small = cv2.resize(premultiplied, (CELL, CELL), interpolation=cv2.INTER_AREA)
@@ -75,14 +77,14 @@ def _finished(canvas: Canvas) -> NDArray[np.uint8]:
         ),
     )
     small_alpha = small[..., 3:] * 255.0
-    # A clear rim keeps neighbours from bleeding in through the mipmaps.
+    # The transparent rim keeps colours of neighbouring cells out of the mipmaps.
     small_alpha[[0, 1, -1], :] = 0.0
     small_alpha[:, [0, 1, -2, -1]] = 0.0
     return np.concatenate([np.clip(colour, 0, 255), small_alpha], axis=-1).astype(np.uint8)
 
 
 def _disc(canvas: Canvas, x: float, y: float, radius: float, colour: FloatArray) -> None:
-    """An opaque disc; x, y from the lower left in cell units 0 to 1."""
+    """Draw an opaque disc; x, y, radius are shares of the cell, from its lower left corner."""
     size = canvas.shape[0]
     centre = (round(x * size), round((1.0 - y) * size))
     cv2.circle(canvas, centre, max(1, round(radius * size)), (*colour.tolist(), 1.0), -1)
@@ -106,7 +108,8 @@ def _leaves(
     leaf: float,
     colour: tuple[float, float, float],
 ) -> None:
-    """Discs in elliptic clusters (x, y, rx, ry): dark ones first, light ones above and last."""
+    """Draw `count` random discs in each of the elliptic clusters (x, y, rx, ry): dark discs first,
+    then lighter ones, which lie higher. `leaf` is the mean radius as a share of the cell."""
     base = np.array(colour)
     spots = []
     for x, y, rx, ry in clusters:
@@ -188,11 +191,12 @@ def _birch(canvas: Canvas, rng: np.random.Generator) -> None:
 
 
 def outline(alpha: NDArray[np.uint8]) -> FloatArray:
-    """A convex polygon (CORNERS, 2) round the picture of `alpha` (size, size), within its cell."""
+    """Return a convex polygon (CORNERS, 2) round the picture of `alpha` (size, size), in its
+    cell."""
     size = alpha.shape[0]
     spread = cv2.dilate((alpha > 0).astype(np.uint8), np.ones((2 * _BLEED + 1,) * 2, np.uint8))
     points = cv2.findNonZero(spread).reshape(-1, 2)
-    # A texel is a square: all four of its corners must be inside.
+    # A texel is a square, so all four of its corners must be inside the polygon.
     squares = np.concatenate(
         [points + np.array(shift) for shift in ((0, 0), (1, 0), (0, 1), (1, 1))]
     )
@@ -204,8 +208,8 @@ def outline(alpha: NDArray[np.uint8]) -> FloatArray:
 
 
 def _one_fewer(polygon: FloatArray) -> FloatArray:
-    """The polygon without one edge, whose neighbours are extended until they meet: the edge for
-    which this adds the least area."""
+    """Remove one edge of the polygon and extend its two neighbours until they meet. Of all edges,
+    remove the one for which this adds the least area."""
     best, least = polygon, np.inf
     for k in range(len(polygon)):
         before, a, b, after = (polygon[(k + shift) % len(polygon)] for shift in (-1, 0, 1, 2))
@@ -223,7 +227,8 @@ def _one_fewer(polygon: FloatArray) -> FloatArray:
 
 
 def _meeting(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray | None:
-    """Where the lines from a through b and from c through d meet beyond b and d."""
+    """Return the point where the lines from a through b and from c through d meet beyond b and d;
+    None if there is no such point."""
     u, v = b - a, d - c
     slope = _cross(u, v)
     if abs(slope) < 1e-12:

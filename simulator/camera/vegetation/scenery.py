@@ -1,4 +1,4 @@
-"""Positions, sizes and tints of the trees beside the road, by seed. World frame, metres."""
+"""Selects positions, sizes and tints of the trees beside the road, by seed. World frame, metres."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,24 +16,24 @@ from simulator.track.road import Road
 CLEAR_M = 1.6
 """Least distance of a trunk from a wall line."""
 DRY_M = 1.5
-"""Least height of trees and props above the sea."""
+"""Least height of trees and props above the sea level."""
 HEIGHT_M = {
     "oak": (6.0, 12.0), "poplar": (9.0, 17.0), "pine": (8.0, 16.0), "fir": (7.0, 18.0),
     "palm": (6.0, 10.0), "bush": (1.2, 3.0), "birch": (7.0, 13.0),
 }  # fmt: skip
 
 LEAF_SHEDDING = ("oak", "poplar", "birch", "bush")
-"""Trees that turn yellow and red in autumn."""
+"""Kinds of trees that may turn yellow or red in autumn."""
 SHADY = ("oak", "birch", "pine", "fir")
 AVENUE_STEP_M, OVERHANG_M = 18.0, 2.5
 TUNNEL_STEP_M, TUNNEL_OVERHANG_M = 9.0, 4.5
-"""Spacing of the trees of a tunnel, and reach of their crowns over the asphalt."""
+"""Spacing of the trees of a tunnel, and distance that their crowns reach over the asphalt."""
 
 
 @dataclass(frozen=True)
 class Trees:
-    """N trees: feet (N, 3), width and height (N,), cell of the atlas, colour tint (N, 3) and their
-    position (s, offset) beside the road."""
+    """N trees. `feet` (N, 3) m, world; `width` and `height` (N,) m; `cell` (N,) of the atlas;
+    `tint` (N, 3), factors on the colour; `s` and `offset` (N,) m, position beside the road."""
 
     feet: FloatArray
     width: FloatArray
@@ -53,7 +53,7 @@ def plant(
     avenue: bool,
     tunnel: bool = False,
 ) -> Trees:
-    """The trees of a scene, in groves, denser near the road.
+    """Select the trees of a scene. They stand in groves, denser near the road.
 
     `avenue` adds a row of tall trees behind each wall line that meet over the road. `tunnel` makes
     these rows denser, and the crowns close over the road.
@@ -71,7 +71,7 @@ def plant(
     width = height * np.array([foliage.ASPECT[kind] for kind in kinds])
     width *= rng.uniform(0.85, 1.15, len(s))
     free, x, y = ground.place_beside(s, offset, CLEAR_M - 0.1)
-    # Branches may reach over the rail; over the lanes only where they are high enough.
+    # Crowns may reach over the rail, and over the asphalt by 0.5 m and the kind's `overhang`.
     near = np.abs(offset) - width / 2.0
     keep = free & (near > road.half_asphalt - 0.5 - overhang) & free_of(bridges, x, y)
     z = ground.height(s, offset, x, y) - 0.12
@@ -86,8 +86,8 @@ def plant(
 
 
 Sites = tuple[FloatArray, FloatArray, NDArray[np.str_], FloatArray, FloatArray]
-"""N trees: s, offset, kind, size (0 to 1: least to greatest height of the kind), and how far the
-crown may reach over the asphalt."""
+"""N candidate trees: s (m), offset (m), kind, size (0 to 1, from least to greatest height of the
+kind), and the distance (m) that the crown may reach over the asphalt."""
 
 
 def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
@@ -97,7 +97,7 @@ def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
     s = rng.uniform(0.0, length, count)
     side = rng.choice([-1.0, 1.0], count)
     reach = theme.tree_reach_m * rng.beta(1.1, 2.0, count)
-    # Groves and clearings: waves along s thin the trees out.
+    # Waves of density along s make groves and clearings.
     phase = rng.uniform(0.0, 2 * np.pi, (3, 1))
     waves = np.sin(phase + 2 * np.pi * s / np.array([[310.0], [137.0], [71.0]]) + side)
     stay = rng.uniform(0.0, 1.0, count) < 1.0 + theme.clearings * (waves.sum(axis=0) - 1.5)
@@ -108,7 +108,7 @@ def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
 
 
 def _avenue(road: Road, theme: Theme, rng: np.random.Generator, *, tunnel: bool) -> Sites:
-    """Tall trees along both wall lines: kinds of the theme that give shade, otherwise pines."""
+    """Return tall trees along both wall lines: the theme's kinds that give shade, or pines."""
     shady = [kind for kind in theme.trees if kind in SHADY] or ["pine"]
     step_m, overhang = (TUNNEL_STEP_M, TUNNEL_OVERHANG_M) if tunnel else (AVENUE_STEP_M, OVERHANG_M)
     step = road.track.length_m / max(1, round(road.track.length_m / step_m))
@@ -121,7 +121,8 @@ def _avenue(road: Road, theme: Theme, rng: np.random.Generator, *, tunnel: bool)
 
 
 def _tints(rng: np.random.Generator, sheds: NDArray[np.bool_], autumn: float) -> FloatArray:
-    """Random colour factors (N, 3); in autumn some deciduous trees turn yellow or red."""
+    """Return random colour factors (N, 3). `autumn` (0 to 1): share of the leaf-shedding trees
+    (`sheds`) that turn yellow or red, times 0.6."""
     count = len(sheds)
     tone = rng.uniform(0.7, 1.25, (count, 1))
     tint = tone * (1.0 + rng.uniform(-0.12, 0.12, (count, 3)))

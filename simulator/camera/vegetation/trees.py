@@ -1,7 +1,7 @@
-"""Drawing of trees: the nearest visible ones, each a billboard (a textured quad facing the camera).
+"""Draws the nearest visible trees, each as a billboard (a textured quad that faces the camera).
 
-The opaque part is drawn first, the nearest tree first, so that the depth test hides what is behind;
-the soft edges are blended after all else, the farthest first.
+The opaque parts are drawn first, the nearest tree first, so that the depth test skips what they
+hide. The soft edges are blended after everything else, the farthest tree first.
 """
 
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ Part = Literal["core", "fringe", "labels"]
 
 REACH_M = 420.0
 MOST = 160
-"""Largest number of trees drawn at once; the farthest are left out."""
+"""Largest number of trees drawn at once; trees farther away are left out."""
 NEAR_M = 80.0
-"""Trees nearer than this are drawn in two passes and within their outline; for farther trees, the
-extra vertices would cost more than they save."""
+"""Nearer trees are drawn in two passes and within their outline. For farther trees the additional
+vertices would cost more time than they save."""
 _SQUARE = ((-0.5, 0.0), (0.5, 0.0), (0.5, 1.0), (-0.5, 1.0))
 _SQUARE_FAN = np.array([[0, 1, 2], [0, 2, 3]])
 _OUTLINE_FAN = 4 + np.array([[0, k, k + 1] for k in range(1, CORNERS - 1)])
@@ -32,15 +32,15 @@ _OUTLINE_FAN = 4 + np.array([[0, k, k + 1] for k in range(1, CORNERS - 1)])
 
 @dataclass(frozen=True)
 class VisibleTrees:
-    """Indices of the corners of triangles (n, 3), the nearest tree's first; the first `near` of
-    them are those of near trees."""
+    """Corner indices (n, 3) of the triangles of the visible trees, nearest tree first. The first
+    `near` triangles belong to near trees."""
 
     corners: NDArray[np.uint32]
     near: int
 
 
 class TreeMesh:
-    """All trees of a scene."""
+    """All trees of a scene in graphics memory."""
 
     def __init__(self, graphics: Graphics, trees: Trees, weather: str, *features: str) -> None:
         self._feet = trees.feet
@@ -75,11 +75,11 @@ class TreeMesh:
         }
 
     def visible(self, eye: FloatArray, planes: FloatArray, from_above: bool) -> VisibleTrees:
-        """Frustum culling: the trees visible from `eye` (3,)."""
+        """Return the trees visible from `eye` (3,) within the side planes `planes` (4, 3)."""
         trees = visible_spheres(self._feet, self._size, REACH_M, MOST, eye, planes)
         squared = ((self._feet[trees] - eye) ** 2).sum(axis=1)
         near = int(np.searchsorted(squared, NEAR_M**2))
-        # Seen from above, a tree is drawn as a crown, which has another outline.
+        # Trees seen from above are drawn as crowns, which do not have the outline of their kind.
         fan = _SQUARE_FAN if from_above else _OUTLINE_FAN
         first = self._corners * trees[:, None, None]
         corners = np.concatenate(
@@ -88,8 +88,9 @@ class TreeMesh:
         return VisibleTrees(corners.astype(np.uint32), near * len(fan))
 
     def draw(self, seen: VisibleTrees, part: Part) -> None:
-        """Draw the visible trees: the "core" of the near ones, then, blended over all else, the
-        "fringe" and the far ones whole; or all of them at once as "labels"."""
+        """Draw one part of the visible trees: "core", the opaque part of near trees; "fringe",
+        blended over all else, the edges of near trees and far trees as a whole; "labels", all
+        trees."""
         corners = seen.corners[: seen.near] if part == "core" else seen.corners
         if len(corners) == 0:
             return

@@ -1,1 +1,1 @@
-"""Processes that draw the pictures of many cars into shared memory."""
+"""Worker processes that draw the pictures of many cars into shared memory."""

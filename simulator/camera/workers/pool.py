@@ -1,8 +1,7 @@
-"""Worker processes that draw the pictures of many cars; each worker draws the pictures of its own
-cars.
+"""Starts worker processes that draw the pictures of many cars; each worker draws its own cars.
 
-The workers are new interpreters, neither forked nor imported from the user's script: OpenGL does
-not survive a fork, and a script needs no `if __name__ == "__main__"`.
+The workers are new interpreters. They are not forked, because OpenGL does not survive a fork, and
+they do not import the user's script, so the script needs no `if __name__ == "__main__"`.
 """
 
 import os
@@ -27,21 +26,21 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 SILENCE_S = 300
-"""Longest wait (s) for one picture, which may need a new scene: one takes seconds to build."""
+"""Longest wait (s) for one picture; it may require a new scene, which takes seconds to build."""
 END_S = 5.0
 KEPT_CAMERAS = 8
-"""Cameras that a worker keeps at least: on random roads, cars come back to earlier ones."""
+"""Least number of cameras that a worker keeps, as cars on random roads return to earlier ones."""
 MODULE = "simulator.camera.workers.worker"
 
 
 class PictureWorkerError(UserError):
-    """A worker process has ended or hangs, so that there are no pictures."""
+    """Raised if a worker process has ended or does not answer, so that there are no pictures."""
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A worker process and the connection to it; its cars, the sceneries that it was sent, and the
-    cars whose pictures it has yet to draw (`due`)."""
+    """A worker process and the connection to it. `cars` are its cars, `sceneries` the numbers of
+    the sceneries sent to it, and `due` the cars whose pictures it has not drawn yet."""
 
     number: int
     process: "subprocess.Popen[bytes]"
@@ -50,15 +49,15 @@ class _Worker:
     sceneries: set[int] = field(default_factory=set)
     due: set[int] = field(default_factory=set)
     heard: float = 0.0
-    """Time of the last sign of life while pictures are due."""
+    """Time (`monotonic`, s) of its last answer or task."""
 
 
 class PicturePool:
     """Draws pictures of `cars` cars in `workers` processes.
 
-    `formats`: the picture of one car, by the name of its view. The processes start with the first
-    picture. An error, Ctrl-C or `close` ends the processes and frees their shared memory; the next
-    picture starts new processes.
+    `formats` describes the picture of one car, by the name of its view. The first picture starts
+    the processes. An error, Ctrl-C or `close` ends the processes and frees their shared memory; the
+    next picture starts new processes.
     """
 
     def __init__(
@@ -79,32 +78,32 @@ class PicturePool:
 
     @property
     def views(self) -> tuple[str, ...]:
-        """The views that have room in the shared memory."""
+        """Names of the views that have room in the shared memory."""
         return tuple(self._formats)
 
     @property
     def running(self) -> bool:
-        """Whether this process has started workers. Workers of the process that it was forked from
-        do not count."""
+        """Whether this process has started workers. In a forked child the parent's workers do not
+        count."""
         return bool(self._workers) and self._owner == os.getpid()
 
     def number_of(self, scenery: Scenery) -> int:
-        """The number of a scenery in a `Shot`; each scenery is sent to a worker once."""
-        key = (id(scenery.road), scenery.light, scenery.light_seed)  # the list keeps the road alive
+        """Return the number of `scenery` in a `Shot`. A scenery is sent to a worker only once."""
+        key = (id(scenery.road), scenery.light, scenery.light_seed)  # _sceneries keeps the id valid
         if key not in self._numbers:
             self._numbers[key] = len(self._sceneries)
             self._sceneries.append(scenery)
         return self._numbers[key]
 
     def pictures(self, view: str) -> NDArray[Any]:
-        """The pictures (cars, *shape) of `view` in the shared memory; a car that was never drawn is
-        all zeros."""
+        """Return the pictures (cars, *shape) of `view` in the shared memory. The picture of a car
+        that was never drawn is all zeros."""
         self._start()
         return self._pictures[view]
 
     def draw(self, shots: Sequence[Shot], views: tuple[str, ...]) -> None:
-        """Draw `views` of each shot's car. Raises PictureWorkerError, which names the worker, when
-        one dies or hangs, and the UserError of a worker that cannot draw."""
+        """Draw `views` of each shot's car. Raises PictureWorkerError, which names the worker, if a
+        worker dies or does not answer, and the UserError of a worker that cannot draw."""
         try:
             self._start()
             for worker in self._workers:
@@ -118,14 +117,14 @@ class PicturePool:
             raise
 
     def close(self) -> None:
-        """End the workers; the memory is freed with the last array that views it."""
+        """End the workers. The memory is freed when the last array that views it is deleted."""
         self._end()
         self._workers, self._pictures = [], {}
 
     def _start(self) -> None:
         if self.running:
             return
-        self.close()  # in a forked child: the workers are the parent's
+        self.close()  # in a forked child, forgets the workers of the parent
         descriptor = create_memory(self._cars, self._formats)
         self._owner, workers = os.getpid(), self._workers
         self._end = weakref.finalize(self, _end, workers, self._owner)
@@ -139,7 +138,7 @@ class PicturePool:
 
     def _start_worker(self, number: int, cars: range, descriptor: int) -> _Worker:
         mine, theirs = socket.socketpair()
-        # A stopped worker reads nothing, so sending to it must not wait for ever.
+        # A stopped worker reads nothing, so sending must have a time limit.
         mine.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", SILENCE_S, 0))
         with theirs:
             process = subprocess.Popen(
@@ -154,7 +153,7 @@ class PicturePool:
                 },
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), descriptor),
-                start_new_session=True,  # Ctrl-C is for the parent alone
+                start_new_session=True,  # so that Ctrl-C reaches only the parent
             )
         worker = _Worker(number, process, Connection(mine.detach()), cars)
         cameras = max(KEPT_CAMERAS, len(cars))
@@ -177,7 +176,7 @@ class PicturePool:
             raise self._death(worker) from None
 
     def _receive(self, waiting: list[_Worker]) -> None:
-        """Wait for an answer, and take those that have come."""
+        """Wait for an answer, and process all answers that have arrived."""
         due = min(worker.heard for worker in waiting) + SILENCE_S
         ready = set(wait([worker.connection for worker in waiting], max(due - monotonic(), 0.0)))
         for worker in waiting:
@@ -210,14 +209,14 @@ class PicturePool:
 
 
 def _nothing() -> None:
-    """Do nothing: the finaliser of a pool that has no workers."""
+    """Do nothing. This is the finaliser of a pool without workers."""
 
 
 NEXT = "all picture workers have been ended, and reset() starts new ones"
 
 
 def _how(process: "subprocess.Popen[bytes]") -> str:
-    """A text about how a process ended that has closed its connection."""
+    """Describe how a process that closed its connection ended, as in "ended with exit code 1"."""
     try:
         code = process.wait(END_S)
     except subprocess.TimeoutExpired:
@@ -229,7 +228,7 @@ def _how(process: "subprocess.Popen[bytes]") -> str:
 
 
 def _end(workers: list[_Worker], owner: int) -> None:
-    """Kill and reap the workers; a forked child closes its copies of the connections only."""
+    """Kill and reap the workers. In a forked child, only close its copies of the connections."""
     for worker in workers:
         worker.connection.close()
         if owner == os.getpid():

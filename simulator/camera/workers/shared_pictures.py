@@ -1,7 +1,7 @@
-"""The pictures of many cars in one shared memory without a name.
+"""Stores the pictures of many cars in one anonymous shared memory.
 
-The memory is that of a file descriptor, which child processes inherit. The kernel frees it with the
-last process that has it open or mapped, however that process ends.
+The memory belongs to a file descriptor that child processes inherit. The kernel frees it when no
+process has it open or mapped any more, however the processes end.
 """
 
 import mmap
@@ -18,14 +18,14 @@ PAGE_BYTES = mmap.PAGESIZE
 
 @dataclass(frozen=True)
 class PictureFormat:
-    """Shape and number type of one car's picture of one view."""
+    """Shape and dtype of one car's picture of one view."""
 
     shape: tuple[int, ...]
     dtype: str
 
 
 def create_memory(cars: int, formats: dict[str, PictureFormat]) -> int:
-    """The descriptor of new, zeroed memory for the pictures of `cars` cars; close it after use."""
+    """Create zeroed memory for the pictures of `cars` cars; the caller closes the descriptor."""
     descriptor = os.memfd_create("driverview-pictures")
     os.ftruncate(descriptor, sum(_size_bytes(cars, each) for each in formats.values()))
     return descriptor
@@ -34,8 +34,8 @@ def create_memory(cars: int, formats: dict[str, PictureFormat]) -> int:
 def map_pictures(
     descriptor: int, cars: int, formats: dict[str, PictureFormat]
 ) -> dict[str, NDArray[Any]]:
-    """For each view its pictures (cars, *shape) in the memory; they stay valid when the descriptor
-    is closed."""
+    """Map the memory; returns the pictures (cars, *shape) of each view. They stay valid after the
+    descriptor is closed."""
     memory = mmap.mmap(descriptor, 0)
     pictures, begin = {}, 0
     for view, each in formats.items():
@@ -47,6 +47,6 @@ def map_pictures(
 
 
 def _size_bytes(cars: int, each: PictureFormat) -> int:
-    """Room for the pictures of one view, in whole pages."""
+    """Return the size in bytes of the pictures of one view, rounded up to whole pages."""
     size = cars * prod(each.shape) * np.dtype(each.dtype).itemsize
     return -(-size // PAGE_BYTES) * PAGE_BYTES

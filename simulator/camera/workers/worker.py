@@ -1,6 +1,6 @@
-"""A process that draws pictures of cars into shared memory; `pool` starts it.
+"""A worker process that draws pictures of cars into shared memory; `pool` starts it.
 
-It has the one OpenGL context of its process, and a camera for each scene of its cars.
+It has one OpenGL context, and a camera for each scene of its cars.
 """
 
 import os
@@ -22,13 +22,13 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 PARENT_CHECK_S = 2.0
-"""Interval at which an idle worker checks that its parent lives: a child forked from the parent may
-hold the connection open."""
+"""Interval at which an idle worker checks that its parent is alive. The end of the connection is
+not sufficient, because a process forked from the parent may hold the connection open."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """What a camera is built from: see `open_camera`."""
+    """The arguments of `open_camera` that determine a scene."""
 
     road: Road
     light: str
@@ -37,8 +37,8 @@ class Scenery:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """The picture to draw of one car: number of the scenery, pose of the body (6,), poses of other
-    cars (n, 6), and distance (m) along the road."""
+    """A request to draw the pictures of one car: number of the scenery, body pose (6,), poses of
+    other cars (n, 6), and distance (m) along the road."""
 
     car: int
     scenery: int
@@ -49,18 +49,18 @@ class Shot:
 
 @dataclass(frozen=True)
 class Setup:
-    """First message to a worker: what stays the same for its lifetime."""
+    """The first message to a worker, with the values that are constant for its lifetime."""
 
     cars: int
     formats: dict[str, PictureFormat]
     camera: CameraParameters
     cameras: int
-    """Greatest number of cameras that it keeps."""
+    """Largest number of cameras that the worker keeps."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Shots to draw, each in all `views`, and the sceneries that they are the first to use."""
+    """Shots to draw, each in all `views`, and the sceneries that are new to this worker."""
 
     shots: list[Shot]
     views: tuple[str, ...]
@@ -68,7 +68,7 @@ class Task:
 
 
 class Cameras:
-    """The cameras of the sceneries drawn last, built by `build`; at most `most`."""
+    """The cameras of the sceneries drawn last, at most `most`, made by `build`."""
 
     def __init__(self, most: int, build: Callable[[Scenery], Camera]) -> None:
         self._most, self._build = most, build
@@ -79,7 +79,7 @@ class Cameras:
         self._sceneries |= sceneries
 
     def of(self, scenery: int) -> Camera:
-        """The camera of scenery number `scenery`."""
+        """Return the camera of scenery number `scenery`, built at first use."""
         if scenery not in self._cameras:
             while len(self._cameras) >= self._most:
                 self._cameras.popitem(last=False)[1].close()
@@ -89,8 +89,9 @@ class Cameras:
 
 
 def main(connection: Connection, descriptor: int, parent: int) -> None:
-    """Draw the shots of each task, and answer each picture drawn with the number of its car, until
-    the parent has ended. A UserError is sent back, and ends the process."""
+    """Draw the shots of each task until the parent ends. Each drawn picture is answered with the
+    number of its car. A UserError is sent to the parent and ends the process. `descriptor` is the
+    shared memory, `parent` the parent's process id."""
     setup: Setup = connection.recv()
     pictures = map_pictures(descriptor, setup.cars, setup.formats)
     os.close(descriptor)
@@ -119,7 +120,7 @@ def main(connection: Connection, descriptor: int, parent: int) -> None:
 def draw(
     shot: Shot, views: tuple[str, ...], cameras: Cameras, pictures: dict[str, NDArray[Any]]
 ) -> None:
-    """Draw the views of one car into its rows of `pictures`."""
+    """Draw the views of one car into its rows of `pictures` (cars, *shape) by view."""
     camera = cameras.of(shot.scenery)
     drawn = camera.render_views(shot.pose, shot.others, views, near_s=shot.s)
     for view, picture in drawn.items():
