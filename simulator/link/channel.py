@@ -1,7 +1,7 @@
-"""The two directions of a link: a sender writes a block of the shared memory, a receiver reads it.
+"""The two directions of a link. A sender writes a block of the shared memory, a receiver reads it.
 
-A sender fills `record` (and `image`) and calls `send`. A receiver's `record` and `image` hold the
-newest complete message.
+The user of a sender fills `record` (and `image`) and calls `send`. A receiver's `record` and
+`image` contain the newest complete message.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from simulator.link.sync import futex
 from simulator.link.sync.seqlock import DAMAGED, NOTHING, publish, spin_until_new, try_read
 
 SPIN_COUNT = 30_000
-"""Polls before sleeping: about 20 us, as long as a wake-up takes."""
+"""Number of polls before a receiver sleeps: about 20 us, the duration of a wake-up."""
 
 
 class _MessageBuffer:
@@ -28,7 +28,7 @@ class _MessageBuffer:
         message = np.zeros(1, block.dtype)
         local_picture = np.zeros(image_bytes // MESSAGE_ALIGNMENT, np.uint64)
         self.record: Any = message[0]
-        """The message by field names, as a row of `block.dtype`."""
+        """The message as a row of `block.dtype`, accessed by field names."""
         self.image: NDArray[np.uint8] = local_picture.view(np.uint8)
         self.sequence = words.view(np.uint32)[:1]
         self.arrays = self.sequence, words, message.view(np.uint64), picture, local_picture
@@ -36,7 +36,7 @@ class _MessageBuffer:
 
 
 class Sender:
-    """The only writer of `block`."""
+    """Writes messages to `block`; it must be the block's only writer."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
         self._buffer = _MessageBuffer(segment, block, image_bytes)
@@ -47,12 +47,12 @@ class Sender:
         self.wake()
 
     def wake(self) -> None:
-        """Wake the receiver without a message."""
+        """Wake the receiver without sending a message."""
         futex.wake(self._buffer.address)
 
 
 class Receiver:
-    """Reads `block` without blocking its writer; a block can have any number of receivers."""
+    """Reads messages from `block` without blocking its writer; a block can have many receivers."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
         self._buffer = _MessageBuffer(segment, block, image_bytes)
@@ -61,16 +61,17 @@ class Receiver:
         self.record, self.image = self._buffer.record, self._buffer.image
 
     def poll(self) -> bool:
-        """Whether a newer message arrived; it is then in `record`.
+        """Copy a newer message into `record`, if there is one; returns whether there was one.
 
-        `damaged` is True if its checksum is wrong: the writer then violates the protocol.
+        `damaged` is True if its checksum is wrong, that is, if the writer violates the protocol.
         """
         outcome, self._seen = try_read(*self._buffer.arrays, self._seen)
         self.damaged = outcome == DAMAGED
         return bool(outcome != NOTHING)
 
     def wait(self, seconds: float) -> bool:
-        """As `poll`, but wait up to about `seconds` for a message: spin briefly, then sleep."""
+        """Poll, but wait about `seconds` for a message if there is none: spin briefly, then
+        sleep."""
         current = int(spin_until_new(self._buffer.sequence, self._seen, SPIN_COUNT))
         if current == self._seen or current & 1:
             futex.wait(self._buffer.address, current, seconds)
@@ -78,5 +79,5 @@ class Receiver:
 
 
 def state_image_bytes(segment: Segment) -> int:
-    """Size in bytes of the image in a segment's state messages."""
+    """Return the size in bytes of the image in a segment's state messages."""
     return len(segment.memory) - STATE.end

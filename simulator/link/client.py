@@ -8,7 +8,7 @@
         while message.ended is None:
             message = link.step(Command(steer=-0.5 * message.state.to_middle, throttle=0.2))
 
-Use a Link in only one thread of one process.
+Only one thread of one process may use a Link.
 """
 
 import math
@@ -37,12 +37,12 @@ RETRY_S = 0.02
 
 
 class Link:
-    """A client connected to one server. `wait_s`: time to wait for a server that does not exist
-    yet; `timeout_s`: time to wait for each answer.
+    """A client connected to one server. `wait_s` is the time to wait for a server that does not
+    exist yet, `timeout_s` the time to wait for each answer.
 
-    Every call raises ServerDied soon after the server's end, LinkTimeout without an answer in time,
-    and Refused if the server refuses the request. The constructor raises NoServer, NameInUse,
-    LayoutMismatch.
+    Every call raises ServerDied soon after the server's end, LinkTimeout if no answer arrives in
+    time, and Refused if the server refuses the request. The constructor raises NoServer, NameInUse
+    and LayoutMismatch.
     """
 
     def __init__(
@@ -69,7 +69,8 @@ class Link:
         angle: float = 0.0,
         speed: float = 0.0,
     ) -> Message:
-        """Start an episode, as `World.reset`; without `seed` the server chooses one."""
+        """Start an episode and return its first message; the arguments are those of `World.reset`.
+        Without `seed` the server chooses one."""
         record = self._outbox.record
         record["request"] = Request.RESET
         record["seed"] = -1 if seed is None else seed
@@ -79,18 +80,19 @@ class Link:
         return self._request()
 
     def step(self, command: Command) -> Message:
-        """Hold `command` for one control step; in real time, from the next step on."""
+        """Apply `command` for one control step and return the message after it. In real time, the
+        command is applied from the next step on."""
         write_command(self._outbox.record, command)
         return self._request()
 
     def latest(self) -> Message:
-        """The newest message, without a request; for observers in real time."""
+        """Return the newest message without a request, for observers in real time."""
         self._check_open()
         self._receive()
         return self._message()
 
     def quit(self) -> None:
-        """End the server, and this link."""
+        """End the server and close this link."""
         self._outbox.record["request"] = Request.QUIT
         self._send_and_wait()
         self._closed = True
@@ -138,7 +140,7 @@ class Link:
                 )
 
     def _receive(self, seconds: float = 0.0) -> bool:
-        """Whether a new message came within `seconds`. Raises ServerDied, DamagedMessage."""
+        """Return whether a message arrived within `seconds`. Raises ServerDied, DamagedMessage."""
         came = self._inbox.wait(seconds) if seconds else self._inbox.poll()
         if not came and not self._segment.peer_is_alive():
             came = self._inbox.poll()  # a last message may have arrived before the server ended
@@ -180,7 +182,7 @@ class Link:
 
 
 def _attach(name: str, wait_s: float) -> tuple[Segment, ServerInfo]:
-    """Attach to a ready server, trying again for `wait_s`."""
+    """Attach to a server that is ready, retrying for `wait_s`."""
     until = time.monotonic() + wait_s
     while True:
         try:

@@ -1,4 +1,4 @@
-"""`simulator link`: a server that a client in any language drives over shared memory.
+"""`simulator link`: runs a server; a client in any language drives its car over shared memory.
 
 simulator link --track forza --name /driverview
 simulator link --header driverview_link.h
@@ -60,7 +60,7 @@ def _serve(config: LinkConfig, as_json: bool) -> None:
 
 
 def picture_size(text: str) -> tuple[int, int]:
-    """(width, height) of "WxH", (0, 0) of "none". Raises UserError."""
+    """Parse "WxH" to (width, height) px, "none" to (0, 0). Raises UserError for other text."""
     if text == "none":
         return 0, 0
     width, _, height = text.partition("x")

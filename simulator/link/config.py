@@ -1,4 +1,4 @@
-"""The options of one link server, with their defaults."""
+"""The options of a link server, with their defaults."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -9,7 +9,7 @@ from simulator.track.cli import Lanes, LaneWidth, TracksDir, Traffic
 from trackfeatures import LANE_WIDTH_M
 
 DEFAULT_NAME = "/driverview"
-"""Name of the shared memory."""
+"""Default name of the shared memory."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class LinkConfig:
         int, Option(help="Seed of scenery and light, and of resets without a seed.", min=0)
     ] = 0
     picture: tuple[int, int] = (0, 0)
-    """Width and height of the camera images, (0, 0) for none."""
+    """Width and height of the camera images in px; (0, 0): no images."""
     light: Annotated[str, Option(help="Light of the images, such as clear or rain.")] = "clear"
     tracks_dir: TracksDir = None
     realtime: Annotated[

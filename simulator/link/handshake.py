@@ -1,4 +1,4 @@
-"""The header of the shared memory: the server's description, and the client's check of it."""
+"""The header of the shared memory, which the server writes and the client checks and reads."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -34,7 +34,7 @@ class ServerInfo:
 
 
 def write_header(segment: Segment, info: ServerInfo) -> None:
-    """Describe the server, in a segment not yet published."""
+    """Write the header into a segment that is not published yet."""
     record = _record(segment)
     record["magic"] = MAGIC
     record["byte_order"] = layout.BYTE_ORDER
@@ -49,7 +49,7 @@ def write_header(segment: Segment, info: ServerInfo) -> None:
 
 
 def read_header(segment: Segment) -> ServerInfo:
-    """The server's description. Raises LayoutMismatch."""
+    """Return the server's properties. Raises LayoutMismatch."""
     check_identity(segment)
     record = _record(segment)
     values = {field.name: record[field.name].item() for field in fields(ServerInfo)[1:-1]}
@@ -96,12 +96,12 @@ def phase(segment: Segment) -> Phase:
 
 
 def set_phase(segment: Segment, value: Phase) -> None:
-    """Store the phase; a process that reads it also sees everything written before."""
+    """Store the phase. Who reads the new phase also sees everything written before it."""
     set_word(_phase_word(segment), int(value))
 
 
 def _record(segment: Segment) -> Any:
-    """The header in the memory itself, by field names."""
+    """Return the header as a record with field names that views the shared memory."""
     return np.frombuffer(segment.memory, HEADER.dtype, count=1)[0]
 
 
@@ -111,5 +111,5 @@ def _phase_word(segment: Segment) -> NDArray[np.uint32]:
 
 
 def _truncate(text: str) -> bytes:
-    """`text` as UTF-8, cut to fit its field with a terminating 0."""
+    """Return `text` as UTF-8, cut so that it fits its field of 64 bytes with a terminating 0."""
     return text.encode()[:63].decode(errors="ignore").encode()

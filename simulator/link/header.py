@@ -1,4 +1,4 @@
-"""Generates the C header of the link from the layout's tables, between the fixed parts in c/."""
+"""Generates the link's C header: tables of the layout between the fixed parts in the folder c/."""
 
 from enum import IntEnum
 from importlib.resources import files
@@ -8,7 +8,7 @@ from simulator.link.layout import Block, Field
 
 
 def c_header() -> str:
-    """The whole header."""
+    """Return the text of the complete header."""
     parts = [_read("top.h"), _constants(), *(_enumeration(kind) for kind in layout.ENUMS)]
     parts.append(_read("assert.h"))
     parts += [_struct(block) for block in layout.BLOCKS]
@@ -55,7 +55,7 @@ def _comment(field: Field) -> str:
 
 
 def _assertions(block: Block) -> str:
-    """Static assertions that the compiler's offsets equal the layout's offsets."""
+    """Return static assertions that the compiler's offsets equal the offsets of the layout."""
     struct = f"struct drvlink_{block.name}"
     lines = [
         f"DRVLINK_ASSERT(offsetof({struct}, {name}) == {offset});\n"

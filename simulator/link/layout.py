@@ -1,9 +1,9 @@
-"""The layout of the link's shared memory: its single definition is layout.toml, read here.
+"""The layout of the link's shared memory. layout.toml contains its only definition.
 
-Three blocks, then the camera image: HEADER (written once by the server), COMMAND (written by the
-client) and STATE (written by the server). Native byte order. `simulator link --header FILE`
-generates a C header from the tables. A change of the tables must increase VERSION; a forgotten
-increase is caught by the layout hash.
+The memory consists of three blocks and the camera image: HEADER (the server writes it once),
+COMMAND (the client writes it) and STATE (the server writes it). Byte order is that of the machine.
+`simulator link --header FILE` generates a C header from the tables. A change of the tables must
+increase VERSION; the layout hash detects a forgotten increase.
 """
 
 import hashlib
@@ -19,9 +19,9 @@ import numpy as np
 MAGIC: Final = b"DRVLINK\0"
 VERSION: Final = 1
 BYTE_ORDER: Final = 0x01020304
-"""Reads 0x04030201 on a machine of the other byte order."""
+"""A value that reads as 0x04030201 on a machine with the other byte order."""
 MESSAGE_ALIGNMENT: Final = 8
-"""A message is copied in words of 8 bytes."""
+"""Size in bytes of the words in which a message is copied."""
 
 
 class Phase(IntEnum):
@@ -90,7 +90,7 @@ C_TYPES: Final = {
 
 @dataclass(frozen=True)
 class Field:
-    """One named value, or `count` of them; `kind` is a key of C_TYPES."""
+    """One named value, or an array of `count` values; `kind` is a key of C_TYPES."""
 
     name: str
     kind: str
@@ -107,7 +107,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Block:
-    """A C struct; `offset` is its position in the segment, bytes."""
+    """A C struct; `offset` is its position in the segment, in bytes."""
 
     name: str
     meaning: str
@@ -121,7 +121,7 @@ class Block:
 
     @property
     def places(self) -> dict[str, tuple[int, int]]:
-        """Offset in the block and size, in bytes, of each field by name."""
+        """Offset in the block and size, both in bytes, of each field by name."""
         laid: Any = self.dtype.fields
         return {f.name: (int(laid[f.name][1]), laid[f.name][0].itemsize) for f in self.fields}
 
@@ -131,7 +131,7 @@ class Block:
 
 
 def _read_blocks() -> list[Block]:
-    """The blocks of layout.toml, one after the other."""
+    """Read the blocks of layout.toml; each begins where the previous one ends."""
     text = files("simulator.link").joinpath("layout.toml").read_text(encoding="utf-8")
     blocks: list[Block] = []
     for name, block in tomllib.loads(text).items():
@@ -144,13 +144,14 @@ HEADER, COMMAND, STATE = _read_blocks()
 BLOCKS: Final = (HEADER, COMMAND, STATE)
 IMAGE_OFFSET: Final = STATE.end
 IDENTITY: Final = np.dtype([(f.name, f.numpy_format) for f in HEADER.fields[:5]], align=True)
-"""The fields that are the same in every version: magic to segment_size."""
+"""The fields that are the same in every version of the layout: magic to segment_size."""
 BEAMS: Final = HEADER.places["beam_angles"][1] // 8
 ERROR_BYTES: Final = STATE.places["error_text"][1]
 
 
 def image_bytes(width: int, height: int) -> int:
-    """Size of the image area: RGB, rows from top to bottom, rounded up to whole words."""
+    """Return the size in bytes of the image area: RGB, rows from the top, rounded up to whole
+    words."""
     return -(-width * height * 3 // MESSAGE_ALIGNMENT) * MESSAGE_ALIGNMENT
 
 
@@ -159,7 +160,7 @@ def segment_size(width: int, height: int) -> int:
 
 
 def layout_hash() -> int:
-    """A hash of 64 bits over all names, types, counts, offsets and enumerations."""
+    """Return a hash of 64 bits of all names, types, counts, offsets and enumerations."""
     parts = [f"{block.name}@{block.offset}" for block in BLOCKS]
     parts += [f"{f.name}:{f.kind}x{f.count}" for block in BLOCKS for f in block.fields]
     parts += [f"{kind.__name__}.{m.name}={m.value}" for kind in ENUMS for m in kind]

@@ -1,4 +1,4 @@
-"""Conversion between the records of the shared memory and Python objects."""
+"""Converts between records of the shared memory and Python objects."""
 
 import math
 from dataclasses import dataclass, fields
@@ -21,10 +21,10 @@ Values = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """One state message: the car, its sensors, reward and score."""
+    """A message of the server: the car's state, its sensors, reward and score."""
 
     number: int
-    """Number of the message; in real time a client may miss some."""
+    """Number of the message; a client can miss messages in real time."""
     episode: int
     step: int
     """Control steps since the reset."""
@@ -33,14 +33,14 @@ class Message:
     state: CarState
     features: tf.TrackFeatures
     ranges: NDArray[np.float64]
-    """(19,) m to the track's edge, from +90 to -90 deg."""
+    """Distances (19,) in m to the track's edge, from +90 to -90 deg; -1 off the track."""
     ranges_traffic: NDArray[np.float64]
-    """The same, but a beam ends at a traffic car, too."""
+    """Distances (19,) as `ranges`, but a beam also ends at a traffic car."""
     reward: float
     score: float
     ended: Ending | None
     image: NDArray[np.uint8] | None
-    """(height, width, 3) RGB, None without a camera."""
+    """Camera image (height, width, 3) RGB; None without a camera."""
 
 
 def write_state(record: Any, state: CarState) -> None:
@@ -87,8 +87,8 @@ def read_ending(values: Values) -> Ending | None:
 
 
 def read_message(record: Any, image: NDArray[np.uint8] | None) -> Message:
-    """The message in `record` with its `image`, both copied."""
-    # One tolist() for all fields: reading them one by one takes ten times as long.
+    """Return the message in `record` with its `image`; both are copied."""
+    # One tolist() reads all fields; reading each field separately takes ten times as long.
     values: Values = dict(zip(record.dtype.names, record.tolist(), strict=True))
     return Message(
         **{name: values[name] for name in _COUNTED},

@@ -1,4 +1,4 @@
-"""Runs a link server from its options: builds the world, warms it up, serves until the end."""
+"""Runs a link server with the given options: builds the world, warms it up, and serves."""
 
 import os
 import signal
@@ -29,14 +29,15 @@ if TYPE_CHECKING:
 
 
 def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
-    """Serve until a client's QUIT request, SIGINT or SIGTERM; `report` receives log lines.
+    """Serve until a client sends QUIT, or until SIGINT or SIGTERM; `report` receives log lines.
+    Returns the server's counts.
 
-    Raises UserError for bad options, ClientLost as `LinkServer.serve` does.
+    Raises UserError for bad options, and ClientLost in the same cases as `LinkServer.serve`.
     """
     futex.check_system()
     if not config.patience_s >= 0.0:  # NaN too
         raise UserError(f"--patience is {config.patience_s}; give seconds, or 0 for no limit")
-    remove_stale(config.name)  # fails on a name in use before the world is built
+    remove_stale(config.name)  # raises for a name in use, before the world is built
     with ExitStack() as stack:
         road = Road(find_track(config.track, config.tracks_dir), config.lanes, config.lane_width)
         world = stack.enter_context(
@@ -67,7 +68,7 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
 
 
 def describe(world: World, config: LinkConfig) -> ServerInfo:
-    """The header's description of the server."""
+    """Return the properties of the server for the header."""
     road = world.road
     return ServerInfo(
         track=road.track.name,
@@ -90,7 +91,7 @@ def describe(world: World, config: LinkConfig) -> ServerInfo:
 def _warm_up(
     simulation: Callable[[Any, NDArray[np.uint8]], Simulation], config: LinkConfig
 ) -> None:
-    """Compile, and render a first image, before the first client connects."""
+    """Compile all functions and render a first image before the first client connects."""
     state, command = np.zeros(1, STATE.dtype)[0], np.zeros(1, COMMAND.dtype)[0]
     trial = simulation(state, np.zeros(image_bytes(*config.picture), np.uint8))
     for request in (Request.RESET, Request.STEP):

@@ -1,12 +1,13 @@
-"""A named POSIX shared memory segment with two roles, server and client, each held by a file lock.
+"""A named POSIX shared memory segment with two roles, server and client; a file lock holds each
+role.
 
-Each role is an open-file-description lock on one byte. The kernel releases it when the process
-ends, however that happens, so a lock is never stale, unlike a stored pid or a heartbeat; it also
-works between containers that share /dev/shm but not their process ids. Only the holder of the
-server's lock may remove the segment.
+The lock of a role is an open-file-description lock on one byte. The kernel releases it when the
+process ends, for any reason. Therefore a lock is never stale, unlike a stored pid or a heartbeat.
+It also works between containers that share /dev/shm but not their process ids. Only a process that
+holds the server's lock may remove the segment.
 
-Not `multiprocessing.shared_memory`: its resource tracker removes the segment of a running server
-when a client of another process tree ends.
+`multiprocessing.shared_memory` is not used: its resource tracker removes the segment of a running
+server when a client of another process tree ends.
 """
 
 import fcntl
@@ -26,7 +27,7 @@ from simulator.link.errors import LinkError, NameInUse, NoServer
 from simulator.link.layout import MAGIC
 
 SHM = Path("/dev/shm")
-"""Where Linux keeps POSIX shared memory."""
+"""Folder in which Linux stores POSIX shared memory."""
 POLL_INTERVAL_S = 0.05
 """Interval at which a waiting process checks that its peer is alive."""
 MAX_NAME_BYTES = 250
@@ -35,7 +36,7 @@ FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, pid
 
 
 class Role(IntEnum):
-    """The byte of the segment that a role locks."""
+    """The roles; the value is the byte of the segment that the role locks."""
 
     SERVER = 0
     CLIENT = 1
@@ -43,7 +44,7 @@ class Role(IntEnum):
 
 @dataclass(eq=False)
 class Segment:
-    """A mapped segment in which this process holds one role."""
+    """A mapped segment in which this process has one role."""
 
     name: str
     role: Role
@@ -51,17 +52,17 @@ class Segment:
     memory: mmap.mmap
 
     def bytes(self) -> NDArray[np.uint8]:
-        """All bytes of the segment, shared with the peer."""
+        """Return all bytes of the segment; the array shares the memory with the peer."""
         return np.frombuffer(self.memory, dtype=np.uint8)
 
     def peer_is_alive(self) -> bool:
-        """Whether a process holds the other role."""
+        """Return whether a process has the other role."""
         return is_locked(self.descriptor, Role(1 - self.role))
 
     def publish(self) -> None:
-        """Give a new, complete segment its name; replaces the segment of a dead server.
+        """Give a new, complete segment its name; replace the segment of a dead server.
 
-        Raises NameInUse, LinkError; see `clear`.
+        Raises NameInUse and LinkError; see `remove_stale`.
         """
         folder = os.open(SHM, os.O_RDONLY)
         try:
@@ -78,9 +79,9 @@ class Segment:
             os.close(folder)
 
     def close(self) -> None:
-        """Release the role; removes the segment if no server is running.
+        """Release the role; remove the segment if no server is running.
 
-        The memory itself stays mapped as long as there are views of it.
+        The memory itself stays mapped as long as arrays view it.
         """
         if self.descriptor >= 0:
             _remove_if_dead(self.name, self.descriptor)
@@ -92,7 +93,7 @@ _open: "weakref.WeakSet[Segment]" = weakref.WeakSet()
 
 
 def _close_in_child() -> None:
-    """Close the descriptors in a forked child: it shares the locks and would keep them held."""
+    """Close the descriptors in a forked child, because it shares the locks and would keep them."""
     for segment in _open:
         if segment.descriptor >= 0:
             os.close(segment.descriptor)
@@ -104,7 +105,7 @@ os.register_at_fork(after_in_child=_close_in_child)
 
 def check_name(name: str) -> str:
     """Return `name`. Raises LinkError unless it is a valid name of shared memory on every system: a
-    slash and then a plain name."""
+    slash and a plain name."""
     if not name.startswith("/") or len(name) < 2:
         raise LinkError(f"the link's name is {name!r}; it begins with a slash: /driverview")
     if "/" in name[1:] or "\0" in name or name in ("/.", "/.."):
@@ -117,10 +118,10 @@ def check_name(name: str) -> str:
 
 
 def create(name: str, size: int) -> Segment:
-    """A segment of zeros with the server's role held; it has no name until it is published.
+    """Create a segment of zeros with the role of the server. It has no name until it is published.
 
-    The memory is allocated now: a later write to a page without memory would be a bus error.
-    Raises LinkError when there is not enough memory.
+    All memory is allocated at once, because a later write to a page without memory would cause a
+    bus error. Raises LinkError if there is not enough memory.
     """
     check_name(name)
     descriptor = os.open(SHM, os.O_TMPFILE | os.O_RDWR, 0o600)
@@ -139,7 +140,8 @@ def create(name: str, size: int) -> Segment:
 def remove_stale(name: str) -> None:
     """Remove the segment of a dead server, if there is one.
 
-    Raises NameInUse when its server is running, LinkError when it belongs to another program.
+    Raises NameInUse if its server is running, and LinkError if the segment belongs to another
+    program.
     """
     try:
         descriptor = _open_name(check_name(name), os.O_RDWR)
@@ -161,10 +163,10 @@ def remove_stale(name: str) -> None:
 
 
 def attach(name: str) -> Segment:
-    """The segment of a running server, with the client's role held.
+    """Attach to the segment of a running server, with the role of the client.
 
-    Raises NoServer when there is none (a dead server's segment is removed), NameInUse when another
-    client is there.
+    Raises NoServer if there is no server (the segment of a dead server is removed), and NameInUse
+    if the server has another client.
     """
     check_name(name)
     try:
@@ -190,7 +192,7 @@ def attach(name: str) -> Segment:
 
 
 def _map(name: str, role: Role, descriptor: int) -> Segment:
-    # A separate open: mmap keeps a duplicate of its descriptor, which would keep the lock held.
+    # The segment is opened again, because mmap duplicates its descriptor and so keeps its lock.
     mapped = os.open(f"/proc/self/fd/{descriptor}", os.O_RDWR)
     try:
         memory = mmap.mmap(mapped, os.fstat(mapped).st_size)
@@ -212,20 +214,20 @@ def _check_is_link(name: str, descriptor: int) -> None:
 
 
 def _remove_if_dead(name: str, descriptor: int) -> None:
-    """Remove a segment whose server is dead, unless a new server has taken the name."""
+    """Remove the segment if its server is dead, unless a new server uses the name."""
     if try_lock(descriptor, Role.SERVER) and _is_named(name, descriptor):
         _path(name).unlink()
 
 
 def is_locked(descriptor: int, role: Role) -> bool:
-    """Whether another process (or another opening of the segment) holds `role`."""
+    """Return whether another process (or another opening of the segment) has `role`."""
     wanted = struct.pack(FLOCK, fcntl.F_WRLCK, os.SEEK_SET, role, 1, 0)
     found = fcntl.fcntl(descriptor, fcntl.F_OFD_GETLK, wanted)
     return bool(struct.unpack(FLOCK, found)[0] != fcntl.F_UNLCK)
 
 
 def try_lock(descriptor: int, role: Role) -> bool:
-    """Take `role` for as long as the descriptor is open; False if another process holds it."""
+    """Take `role` until the descriptor is closed; returns False if another process has it."""
     wanted = struct.pack(FLOCK, fcntl.F_WRLCK, os.SEEK_SET, role, 1, 0)
     try:
         fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, wanted)
@@ -235,7 +237,7 @@ def try_lock(descriptor: int, role: Role) -> bool:
 
 
 def _is_named(name: str, descriptor: int) -> bool:
-    """Whether `name` is still the name of the segment that is open as `descriptor`."""
+    """Return whether the segment opened as `descriptor` still has the name `name`."""
     try:
         current = _open_name(name, os.O_RDONLY)
     except FileNotFoundError:
@@ -247,7 +249,7 @@ def _is_named(name: str, descriptor: int) -> bool:
 
 
 def _path(name: str) -> Path:
-    """The file that shm_open(name) opens in C."""
+    """Return the path of the file that shm_open(name) opens in C."""
     return SHM / name[1:]
 
 

@@ -1,7 +1,8 @@
-"""The loop of a link server: reads commands, answers them with a Simulation, tracks its client.
+"""The loop of a link server: reads commands, answers them with a Simulation, and observes its
+client.
 
-In lock-step mode it waits for a command before each control step. In real-time mode it steps by the
-wall clock, holding the last command, while an episode runs.
+In lock-step mode the server waits for a command before each control step. In real-time mode it
+steps by the wall clock and repeats the last command, as long as an episode runs.
 """
 
 import time
@@ -33,23 +34,23 @@ _LEAVING = (Request.LEAVE, Request.QUIT)
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts of a server's clients, episodes, steps and refusals."""
+    """Counts of a server's clients, episodes, steps and refused commands."""
 
     clients: int
     clients_lost: int
-    """Clients that died without disconnecting."""
+    """Number of clients that died without disconnecting."""
     episodes: int
     steps: int
     refused: int
-    """Refused commands."""
+    """Number of refused commands."""
 
 
 class LinkServer:
-    """Serves one link. `make_simulation(record, image)` builds the Simulation that fills them.
+    """Serves one link. `make_simulation(record, image)` builds the Simulation that fills both.
 
-    `once`: end when the first client leaves. `patience_s`: give up a running client that sends
-    nothing for longer (0: never). `report` receives log lines. Raises NameInUse, LinkError; see
-    `segment`.
+    `once`: end when the first client leaves. `patience_s`: longest silence of a running client;
+    after it the server ends (0: no limit). `report` receives log lines. Raises NameInUse and
+    LinkError; see `segment`.
     """
 
     def __init__(
@@ -79,9 +80,11 @@ class LinkServer:
         self._segment.publish()
 
     def serve(self, interrupted: Callable[[], bool] = lambda: False) -> None:
-        """Answer requests until a client sends QUIT or leaves with `once`, or until `interrupted`.
+        """Answer requests until a client sends QUIT or, with `once`, leaves, or until
+        `interrupted()`.
 
-        Raises ClientLost when a client dies with `once`, or sends nothing for `patience_s`.
+        Raises ClientLost if a client dies with `once`, or if a client sends nothing for
+        `patience_s`.
         """
         while not (self._done or interrupted()):
             if self._wait_for_command():
@@ -113,8 +116,8 @@ class LinkServer:
         self.close()
 
     def _wait_for_command(self) -> bool:
-        """Wait up to POLL_INTERVAL_S for a command (in real time: until the next tick). Returns
-        whether a command arrived."""
+        """Wait at most POLL_INTERVAL_S, or in real time until the next step, for a command. Returns
+        whether one arrived. In real time, step if none arrived."""
         if self._pacer is None or not self._simulation.running:
             return self._inbox.wait(POLL_INTERVAL_S)
         self._outbox.record["late_steps"] += self._pacer.wait()
@@ -137,7 +140,7 @@ class LinkServer:
         if int(record["episode"]) != before[0] and self._pacer is not None:
             self._pacer.restart()
         elif self._pacer is not None and before[1] == record["step"] and self._simulation.running:
-            self._simulation.advance()  # refused, but in real time the step takes place
+            self._simulation.advance()  # in real time, a step follows a refused command too
         record["session"], record["answers"] = request["session"], request["number"]
         self._send()
         if not self._inbox.damaged and request["request"] in _LEAVING:

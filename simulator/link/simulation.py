@@ -1,7 +1,7 @@
 """Handles a client's requests: steps the world and writes the answer into a record.
 
-Independent of the shared memory. A bad request is answered with an error code and a message, and
-leaves the state of the car unchanged.
+This module does not depend on the shared memory. A bad request is answered with an error code and a
+message, and leaves the state of the car unchanged.
 """
 
 import math
@@ -27,7 +27,8 @@ _NOT_OPEN = "there is no episode yet; ask for a reset first"
 
 
 class Simulation:
-    """One world behind a link. `record` is a row of the layout's STATE, `image` its image buffer.
+    """One world behind a link. `record` is a row of the layout's STATE, `image` the buffer for its
+    image.
 
     A reset without a seed starts episode n with the seed `seed` + n.
     """
@@ -53,7 +54,7 @@ class Simulation:
 
     @property
     def position_text(self) -> str:
-        """Step and episode, for messages."""
+        """Step and episode as text for messages."""
         return f"at step {int(self._record['step'])} of episode {self.episodes}"
 
     @property
@@ -79,11 +80,11 @@ class Simulation:
             self._refuse(Refusal.UNKNOWN_REQUEST, f"the request is {asked}; there are {known}")
 
     def reject(self, text: str) -> None:
-        """Answer a command with a wrong checksum."""
+        """Answer a command whose checksum is wrong; `text` is the error message."""
         self._refuse(Refusal.BAD_CHECKSUM, text)
 
     def advance(self) -> None:
-        """Step with the last command, without a request (real-time mode).
+        """Step the world with the last command, without a request (real-time mode).
 
         If contacts cannot be computed, the episode is closed, and the next step is refused.
         """
@@ -139,8 +140,8 @@ class Simulation:
             self._measure(state, stepped=True)
 
     def _measure(self, state: CarState, *, stepped: bool) -> None:
-        """Write state, features, ranges, reward and image into the record; the reward of a reset
-        is 0."""
+        """Write state, features, ranges, reward and image into the record. The reward of a reset is
+        0."""
         record, world = self._record, self._world
         ended = ending(state)
         reward = 0.0
@@ -155,7 +156,7 @@ class Simulation:
         write_ending(record, ended)
         write_features(record, world.features())
         record["ranges"] = read_track_range(world)
-        # Without traffic both are equal; computing the beams twice would be expensive.
+        # Without traffic both are equal, and computing the beams twice would be slow.
         record["ranges_traffic"] = read_range(world) if world.traffic.count else record["ranges"]
         if self._camera is not None:
             picture = self._camera.render(world.body_pose(), world.traffic.poses())

@@ -1,4 +1,4 @@
-"""Range beams in the road plane: distance to the track's edge and to traffic. Metres, radians."""
+"""Range beams in the road plane: distances to the track's edge and to traffic. Metres, radians."""
 
 import math
 
@@ -11,10 +11,10 @@ from simulator.track.piece_table import COS0, CURVATURE, LENGTH, SIN0, X0, Y0, T
 RANGE_M = 200.0
 OFF_TRACK = -1.0
 BEAM_ANGLES: FloatArray = np.radians(np.arange(90.0, -91.0, -10.0))
-"""(19,) angles from the car's heading, from +90 deg (left) to -90 deg."""
+"""Angles (19,) of the beams from the car's heading, from +90 deg (left) to -90 deg."""
 
 MOST_PIECES = 4096
-"""Limit on the track pieces a beam may cross; 200 m of the finest spiral have some hundred."""
+"""Largest number of pieces that a beam crosses; 200 m of the finest spiral have about 100."""
 
 
 @compiled
@@ -28,9 +28,9 @@ def track_beams(
     edge: float,
     distances: FloatArray,
 ) -> None:
-    """Fill `distances` (n,) with the distances (m) to the track's edge along `angles` from the
-    heading; -1 off the track. `piece`: the piece at which the search starts, -1 if unknown.
-    """
+    """Fill `distances` (n,) with the distances (m) from (x, y) to the track's edge in the
+    directions `yaw` + `angles`; -1 if the point is off the track. `edge` is the edge's distance (m)
+    from the centre. The search starts at `piece`, -1 if unknown."""
     at, _, d = locate(table, x, y, piece)
     for i in range(angles.shape[0]):
         if abs(d) > edge:
@@ -43,26 +43,27 @@ def track_beams(
 def edge_distance(
     table: Table, piece: int, x: float, y: float, direction: float, edge: float
 ) -> float:
-    """Distance (m) from a point on the road to the place where the ray leaves it; up to RANGE_M.
+    """Return the distance (m) from a point on the road to the point where the ray leaves it, at
+    most RANGE_M.
 
-    Follows the ray from piece to piece; in each, both edges are lines or circles, and the
-    intersection is the root of a quadratic equation.
+    The function follows the ray from piece to piece. In each piece, both edges are lines or
+    circles, and the intersection is the root of a quadratic equation.
     """
     cos_d, sin_d = math.cos(direction), math.sin(direction)
     passed, last_move = 0.0, 0
     for _ in range(MOST_PIECES):
         cos_h, sin_h = table[piece, COS0], table[piece, SIN0]
         k = table[piece, CURVATURE]
-        # The ray (u, v) + t (cu, cv) in the frame of the piece's start.
+        # The ray is (u, v) + t (cu, cv) in the frame of the piece's start.
         dx, dy = x - table[piece, X0], y - table[piece, Y0]
         u, v = dx * cos_h + dy * sin_h, dy * cos_h - dx * sin_h
         cu, cv = cos_d * cos_h + sin_d * sin_h, sin_d * cos_h - cos_d * sin_h
         exit_t = leaves_edges(k, u, v, cu, cv, edge, passed)
-        # A straight line rotates in one direction about the bend's centre: it crosses the piece
-        # either forwards or backwards, and can leave it at one end only.
+        # A straight line rotates in one direction about the bend's centre. So it crosses the piece
+        # either forwards or backwards, and can leave it only at one end.
         ahead = cu * (1.0 - k * v) + cv * k * u > 0.0
         move = 1 if ahead else -1
-        # A change of direction means that the ray lies in a kink between two pieces.
+        # If the direction changes, the ray lies in a kink between two pieces.
         if move == -last_move:
             return min(exit_t, RANGE_M)
         end_t = crosses_end(table[piece, LENGTH] if ahead else 0.0, k, u, v, cu, cv, move)
@@ -77,16 +78,17 @@ def edge_distance(
 def leaves_edges(
     k: float, u: float, v: float, cu: float, cv: float, edge: float, passed: float
 ) -> float:
-    """Ray distance (m), from `passed` on, at which the ray leaves an endless piece of curvature k.
+    """Return the distance (m) along the ray, from `passed` on, at which the ray leaves an endless
+    piece of curvature k.
 
-    The offset d of (u, v) is the root of k d^2 - 2 d = k (u^2 + v^2) - 2 v, so that the ray's
-    distance from an edge has the sign of a t^2 + 2 b t + c, free of cancellation as k goes to 0.
+    The offset d of the point (u, v) is the root of k d^2 - 2 d = k (u^2 + v^2) - 2 v. So the ray's
+    distance from an edge has the sign of a t^2 + 2 b t + c, without cancellation as k approaches 0.
     """
     b = k * (u * cu + v * cv) - cv
     here = k * (u * u + v * v) - 2.0 * v
     nearest = math.inf
     for side in (1.0, -1.0):
-        # Positive on the road, for both edges; beyond the bend's centre there is no edge.
+        # The polynomial is positive on the road; an edge beyond the bend's centre does not exist.
         if k * side * edge >= 1.0:
             continue
         a, half_b, c = side * k, side * b, side * here + 2.0 * edge - side * k * edge * edge
@@ -98,12 +100,13 @@ def leaves_edges(
 
 @compiled
 def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
-    """The next root t of a t^2 + 2 half_b t + c, positive at `passed`; infinite if none."""
+    """Return the next root t >= `passed` of a t^2 + 2 half_b t + c (positive at `passed`), or
+    infinity."""
     square = half_b * half_b - a * c
     if square < 0.0:
         return math.inf
     root = math.sqrt(square)
-    # Of the two forms of the root, take the one without cancellation: it adds numbers of one sign.
+    # Of the two forms of the root, this one adds numbers of the same sign, without cancellation.
     top, bottom = (half_b + root, -a) if half_b > 0.0 else (c, root - half_b)
     if bottom == 0.0:
         return math.inf
@@ -115,8 +118,8 @@ def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
 def crosses_end(
     along: float, k: float, u: float, v: float, cu: float, cv: float, move: int
 ) -> float:
-    """Distance (m) along the ray at which the ray crosses the normal of the centre line `along` m
-    from the start of the piece."""
+    """Return the distance (m) along the ray at which it crosses the normal of the centre line
+    `along` m from the start of the piece; infinity if it never does in the direction `move`."""
     half_turn = 0.5 * along * k
     sin_half, cos_half = math.sin(half_turn), math.cos(half_turn)
     chord = along if half_turn == 0.0 else along * sin_half / half_turn
@@ -138,12 +141,13 @@ def shorten_at_boxes(
     length: float,
     width: float,
 ) -> None:
-    """Cut `distances` (n,) short where the beam meets a box: poses (k, 6), x, y first, yaw last."""
+    """Shorten `distances` (n,) to the points where the beams meet boxes of `length` x `width` m.
+    `poses` (k, 6) of the boxes begin with x, y and end with yaw."""
     for i in range(angles.shape[0]):
         for k in range(poses.shape[0]):
             turn = poses[k, 5]
             dx, dy = x - poses[k, 0], y - poses[k, 1]
-            # The ray in the box's own frame, cut by its two pairs of sides (slab method).
+            # The ray in the box's own frame is cut by the two pairs of sides (slab method).
             u = dx * math.cos(turn) + dy * math.sin(turn)
             v = -dx * math.sin(turn) + dy * math.cos(turn)
             heading = yaw + angles[i] - turn
@@ -156,7 +160,8 @@ def shorten_at_boxes(
 
 @compiled
 def cut(start: float, rate: float, half: float) -> tuple[float, float]:
-    """The t at which start + t rate enters and leaves [-half, half]; an empty interval if never."""
+    """Return the t at which start + t rate enters and leaves [-half, half], else an empty
+    interval."""
     if abs(rate) < 1e-12:
         return (-math.inf, math.inf) if abs(start) <= half else (math.inf, -math.inf)
     first, second = (-half - start) / rate, (half - start) / rate

@@ -1,12 +1,12 @@
-"""Sensors: a name, a unit, limits, a function that reads it from the world, and its noise.
+"""Sensors: each has a name, a unit, limits, noise, and a function that reads it from the world.
 
-A custom sensor is declared in one line and read with the others:
+A custom sensor is declared in one line and read together with the others:
 
     slip = Sensor("side_slip", "rad", lambda world: atan2(world.state.vy, world.state.vx))
     suite = SensorSuite([*STANDARD, slip], seed=1)
     readings = suite.read(world)        # {"range": array([...]), ..., "side_slip": 0.002}
 
-or, in an environment, `gymnasium.make(..., sensors=("range", "v_x", slip))`.
+In an environment: `gymnasium.make(..., sensors=("range", "v_x", slip))`.
 """
 
 import math
@@ -34,17 +34,17 @@ class Sensor:
     unit: str
     read: Callable[[World], Reading]
     noise: float = 0.0
-    """Standard deviation of the added normal noise, in `unit`; 0 is a perfect sensor."""
+    """Standard deviation of the added normal noise, in `unit`; 0: no noise."""
 
     limits: tuple[float, float] = (-math.inf, math.inf)
-    """Least and largest reading; noise stays within them."""
+    """Least and largest reading; noisy readings are clipped to them."""
 
     invalid: float | None = None
-    """A value outside `limits` that means "no reading", such as the range meter's -1 off the track;
-    it is neither clipped nor noisy."""
+    """A value outside `limits` that means "no reading", such as the range meter's -1 off the track.
+    It is not clipped and gets no noise."""
 
     shape: tuple[int, ...] = ()
-    """Shape of a reading; () is a number."""
+    """Shape of a reading; () means a number."""
 
     dtype: str = "float32"
     """Data type of the reading in an environment's observation."""
@@ -66,9 +66,9 @@ class Sensor:
             )
 
     def measure(self, world: World, rng: np.random.Generator | None = None) -> Reading:
-        """The present reading, clipped to the limits; noisy if `rng` is given.
+        """Return the current reading, clipped to the limits; with noise if `rng` is given.
 
-        Raises UserError for a reading that is not of the declared shape.
+        Raises UserError if the reading does not have the declared shape.
         """
         exact = self.read(world)
         if np.shape(exact) != self.shape:
@@ -86,7 +86,7 @@ class Sensor:
         return min(max(value, self.limits[0]), self.limits[1])
 
     def limit(self, exact: NDArray[Any], rng: np.random.Generator | None = None) -> NDArray[Any]:
-        """`exact` readings of any shape, clipped to the limits; noisy if `rng` is given."""
+        """Return `exact` readings of any shape, clipped to the limits; noisy if `rng` is given."""
         noisy = exact if rng is None else exact + rng.normal(0.0, self.noise, size=exact.shape)
         if exact.dtype.kind in "iu":
             noisy = np.rint(noisy)
@@ -96,10 +96,11 @@ class Sensor:
 
 
 class SensorSuite:
-    """Several sensors read together; their noise depends on `seed` and the order of reading only.
+    """Several sensors that are read together. Their noise depends only on `seed` and the order of
+    reading.
 
-    `noise` sets standard deviations by sensor name. Raises UserError for two sensors of one name
-    or noise for a sensor that is not in the suite.
+    `noise` sets standard deviations by sensor name. Raises UserError if two sensors have the same
+    name, or for noise of a sensor that is not in the suite.
     """
 
     def __init__(
@@ -122,16 +123,16 @@ class SensorSuite:
         self.restart()
 
     def restart(self, seed: int | None = None) -> None:
-        """Restart the noise, with another seed if given; call at the start of an episode."""
+        """Restart the noise, with another seed if given. Call it at the start of an episode."""
         self._seed = self._seed if seed is None else seed
-        # One random stream per sensor: adding a sensor does not change the noise of the others.
+        # Each sensor has its own random stream, so an added sensor does not change other noise.
         self._rngs = [
             np.random.default_rng([self._seed, *sensor.name.encode()]) if sensor.noise else None
             for sensor in self.sensors
         ]
 
     def read(self, world: World) -> dict[str, Reading]:
-        """All readings of the current state, by name."""
+        """Return all readings of the current state, by sensor name."""
         return {
             sensor.name: sensor.measure(world, rng)
             for sensor, rng in zip(self.sensors, self._rngs, strict=True)

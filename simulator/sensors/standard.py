@@ -1,7 +1,7 @@
-"""The sensors of the paper's table, with its ranges and in its units.
+"""The sensors of the paper's table, with its ranges and units.
 
-v_x and v_y are signed and in the body frame, and so are their limits; speed and wheel spin are
-magnitudes, as in the table.
+v_x and v_y are signed components in the body frame, so their limits are signed too. Speed and wheel
+spin are magnitudes, as in the table.
 """
 
 import math
@@ -24,13 +24,13 @@ from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
-KMH = 3.6  # km/h in a m/s
+KMH = 3.6  # km/h per m/s
 CAMERA = "camera"
-"""Name of the camera sensor, the only one that needs a `simulator.camera.Camera`."""
+"""Name of the camera sensor, the only sensor that needs a `simulator.camera.Camera`."""
 
 
 def read_track_range(world: World) -> NDArray[np.float64]:
-    """Distances (19,) m to the track's edge from +90 to -90 deg, in [0, 200]; -1 off the track."""
+    """Return distances (19,) m to the track's edge, from +90 to -90 deg; -1 off the track."""
     now, table = world.state, world.road.track.arrays()
     distances = np.empty(len(BEAM_ANGLES))
     piece = index_at(table, now.s)
@@ -39,7 +39,7 @@ def read_track_range(world: World) -> NDArray[np.float64]:
 
 
 def read_range(world: World) -> NDArray[np.float64]:
-    """As `read_track_range`, but a beam also ends at a traffic car."""
+    """Return the distances of `read_track_range`, but a beam also ends at a traffic car."""
     distances = read_track_range(world)
     if world.traffic.count and distances[0] >= 0.0:
         now = world.state
@@ -84,11 +84,11 @@ STANDARD: tuple[Sensor, ...] = (
     wheel_meter("wheel_spin_rear_left", 2),
     wheel_meter("wheel_spin_rear_right", 3),
 )
-"""The sensors of the paper's table, except the camera (see `camera_sensor`)."""
+"""The sensors of the paper's table except the camera (see `camera_sensor`)."""
 
 
 def camera_sensor(camera: Any, view: str = "front") -> Sensor:
-    """A sensor of the image (H, W, 3) uint8 of a `simulator.camera.Camera`.
+    """Return a sensor that reads the image (H, W, 3) uint8 of a `simulator.camera.Camera`.
 
     Its name is `camera`, or `camera_VIEW` for a view other than the driver's.
     """
@@ -103,13 +103,13 @@ def camera_sensor(camera: Any, view: str = "front") -> Sensor:
 def picture_sensor(
     name: str, read: Callable[[World], NDArray[np.uint8]], shape: tuple[int, int, int]
 ) -> Sensor:
-    """A sensor of uint8 images of `shape`."""
+    """Return a sensor of uint8 images of `shape`."""
     return Sensor(name, "-", read, limits=(0.0, 255.0), shape=shape, dtype="uint8")
 
 
 def sensors_of(chosen: Iterable[str | Sensor]) -> tuple[Sensor, ...]:
-    """The sensors `chosen`; a name stands for the sensor of this name in STANDARD. Raises UserError
-    for an unknown name."""
+    """Replace names in `chosen` by the sensors of these names in STANDARD. Raises UserError for an
+    unknown name."""
     return tuple(sensor if isinstance(sensor, Sensor) else _named(sensor) for sensor in chosen)
 
 

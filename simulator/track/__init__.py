@@ -1,1 +1,1 @@
-"""Tracks: their geometry, where they come from (own, TORCS, CSV), and the road laid on them."""
+"""Tracks: their geometry, their file formats (own, TORCS, CSV), and the road along a track."""

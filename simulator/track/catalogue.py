@@ -1,7 +1,7 @@
-"""Finds tracks by name: the project's own, then TORCS and CSV tracks in the search folders.
+"""Finds tracks by name: the project's own tracks, then TORCS and CSV tracks in the search folders.
 
 The folders in order: `simulator/tracks`, the given folder (`--tracks-dir`), `$TORCS_TRACKS`,
-`/usr/share/games/torcs/tracks`. The first track of a name wins. `random:SEED` is not a file: see
+`/usr/share/games/torcs/tracks`. The first track of a name is used. `random:SEED` is not a file; see
 `random_roads`.
 """
 
@@ -24,9 +24,10 @@ SUFFIXES: Final = (".xml", ".toml", ".csv")
 
 
 def find_track(name: str, tracks_dir: Path | None = None) -> Track:
-    """The track called `name`: a known name, `random:SEED`, or a file (.xml, .toml or .csv).
+    """Return the track called `name`: the name of a track file, `random:SEED`, or the path of a
+    file (.xml, .toml or .csv).
 
-    Raises UnknownTrack with names close to it, TrackError when its file is bad.
+    Raises UnknownTrack, which lists similar names, and TrackError if the file is bad.
     """
     if is_random(name):
         return random_track(name)
@@ -43,7 +44,7 @@ def find_track(name: str, tracks_dir: Path | None = None) -> Track:
 
 
 def list_tracks(tracks_dir: Path | None = None) -> list[Track]:
-    """All tracks that can be found; a bad file is skipped with a warning on stderr."""
+    """Return all tracks in the search folders. A bad file is skipped with a warning on stderr."""
     tracks: list[Track] = []
     for path in track_files(tracks_dir).values():
         try:
@@ -54,8 +55,8 @@ def list_tracks(tracks_dir: Path | None = None) -> list[Track]:
 
 
 def read_track(path: Path) -> Track:
-    """The track in one file; the suffix determines the format."""
-    # Imported for one format only: collecting on own tracks needs neither XML nor scipy.
+    """Read the track in one file; the suffix determines the format."""
+    # Each format imports only its own reader: own tracks need neither XML nor scipy.
     match path.suffix.lower():
         case ".xml":
             from simulator.track.torcs.torcs import read_torcs as read
@@ -67,7 +68,7 @@ def read_track(path: Path) -> Track:
 
 
 def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:
-    """File of every track by name, in the order of the search."""
+    """Return the file of every track by name, in the order of the search."""
     files: dict[str, Path] = {}
     for folder in _folders(tracks_dir):
         for path in _files_in(folder):
@@ -91,16 +92,17 @@ def _folders(tracks_dir: Path | None) -> Iterator[Path]:
 
 
 def _tracks_below(folder: Path) -> Path:
-    """The folder of the tracks: TORCS keeps them in `tracks`; a user can name it or its parent."""
+    """Return `folder`/tracks if it exists, else `folder`: TORCS has its tracks in a subfolder
+    `tracks`, and users give either folder."""
     return folder / "tracks" if (folder / "tracks").is_dir() else folder
 
 
 def _files_in(folder: Path) -> list[Path]:
-    """Track files: NAME.* in the folder itself, and NAME/NAME.xml one and two levels down."""
+    """Return the track files: NAME.* in the folder, and NAME/NAME.xml one and two levels below."""
     here = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
     below = [*folder.glob("*/*.xml"), *folder.glob("*/*/*.xml")]
     named = [path for path in below if path.stem == path.parent.name]
-    # Without directories, and without pipes, on which a reader would wait for ever.
+    # Directories are left out, and pipes, on which a reader would wait for ever.
     return [path for path in sorted(here) + sorted(named) if path.is_file()]
 
 

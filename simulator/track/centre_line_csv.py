@@ -1,7 +1,7 @@
-"""Centre lines as CSV files, read and written.
+"""Reads and writes centre lines as CSV files.
 
-Read: the format of the TUM racetrack database, `x_m,y_m,w_tr_right_m,w_tr_left_m` (metres, one
-point per row, closed, no heights). Written: `s,x,y,z,ang,curv` (m, rad, 1/m) of any track.
+It reads the format of the TUM racetrack database, `x_m,y_m,w_tr_right_m,w_tr_left_m` (metres, one
+point per row, closed, no heights). It writes `s,x,y,z,ang,curv` (m, rad, 1/m) of any track.
 """
 
 import math
@@ -24,16 +24,16 @@ POINTS: Final = (8, 100_000)
 LENGTH_M: Final = (50.0, 100_000.0)
 WIDTH_M: Final = (2.0, 60.0)
 FARTHEST_M: Final = 1e7
-"""Largest coordinate of a map: the northing of UTM ends there."""
+"""Largest coordinate of a map; it is the largest northing of UTM."""
 STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
 """Approximate length of a piece."""
 NOISE_M: Final = (0.05, 1.0)
-"""Least and largest noise (m, RMS) that is smoothed away; a survey's own noise is estimated."""
+"""Bounds (m, RMS) of the smoothed noise; between them it is estimated from the points."""
 SMOOTHER: Final = 1.2
-"""Factor on the noise's variance: too much smoothing still gives a road, too little gives
-wiggles."""
+"""Factor on the noise's variance. It is above 1, because too much smoothing still gives a road, but
+too little gives a wavy one."""
 MIN_RADIUS_M: Final = 5.0
 """A line with a smaller radius is an error of the survey, not a road."""
 MAX_GAP_M: Final = 1e-3
@@ -42,9 +42,9 @@ ROW: Final = "%.6f,%.6f,%.6f,%.6f,%.9f,%.9f\n"
 
 
 def read_centre_line(path: Path) -> Track:
-    """A flat track along the points of a CSV file, as wide as their median width.
+    """Read a flat track along the points of a CSV file; its width is the median of their widths.
 
-    Raises TrackError for a file that is not of this format, or whose points are no closed road.
+    Raises TrackError for a file that is not of this format, or if its points are no closed road.
     """
     points, width = _read_points(path)
     placed = _arcs(points, path)
@@ -67,7 +67,7 @@ def read_centre_line(path: Path) -> Track:
 
 
 def _read_points(path: Path) -> tuple[FloatArray, float]:
-    """Points (N, 2) of the closed line, each once, and the track's width."""
+    """Return the points (N, 2) of the closed line, each once, and the track's width (m)."""
     rows = _read_rows(path)
     widths = rows[:, 2] + rows[:, 3]
     if not (rows[:, 2:] > 0.0).all() or not WIDTH_M[0] <= float(np.median(widths)) <= WIDTH_M[1]:
@@ -126,7 +126,7 @@ def _read_rows(path: Path) -> FloatArray:
 
 
 def _arcs(points: FloatArray, path: Path) -> Placed:
-    """Arcs along a periodic smoothing spline through the points, in the points' coordinates."""
+    """Return arcs along a periodic smoothing spline through the points, in their coordinates."""
     closed = np.vstack((points, points[:1]))
     noise = min(max(survey_noise(points), NOISE_M[0]), NOISE_M[1])
     tck, _ = splprep(closed.T, s=SMOOTHER * len(points) * noise**2, per=1)
@@ -146,10 +146,12 @@ def _arcs(points: FloatArray, path: Path) -> Placed:
 
 
 def survey_noise(points: FloatArray) -> float:
-    """Standard deviation (m) of the lateral noise of points (N, 2) along a smooth closed line.
+    """Estimate the standard deviation (m) of the lateral noise of points (N, 2) along a smooth
+    closed line.
 
-    Each point is compared with the cubic through the two points before and the two after it, over
-    the chord length. The median ignores the few joints where a bend begins abruptly.
+    Each point is compared with the cubic through the two points before it and the two points after
+    it, as a function of the chord length. The median ignores the few joints where a bend begins
+    abruptly.
     """
     before2, before, after, after2 = (np.roll(points, k, axis=0) for k in (2, 1, -1, -2))
     chord = np.hypot(*(after - points).T)
@@ -168,13 +170,14 @@ def survey_noise(points: FloatArray) -> float:
     error = points - np.einsum("in,inj->nj", weights, neighbours)
     along = after - before
     sideways = (along[:, 0] * error[:, 1] - along[:, 1] * error[:, 0]) / np.hypot(*along.T)
-    # The deviation contains the errors of the point and of the four points around it.
+    # The deviation contains the errors of the point and of its four neighbours.
     sideways /= np.sqrt(1.0 + np.sum(weights**2, axis=0))
     return float(np.median(np.abs(sideways)) / 0.6745)
 
 
 def _closing_lengths(length: FloatArray, turn: FloatArray, heading: float) -> FloatArray:
-    """Lengths changed as little as possible, turns kept, so that the last arc meets the first."""
+    """Return the arc lengths, changed as little as possible with constant turns, so that the end of
+    the last arc meets the start of the first."""
     middle = heading + np.concatenate(([0.0], np.cumsum(turn)[:-1])) + turn / 2.0
     chord = np.sinc(turn / (2.0 * np.pi)) * np.stack((np.cos(middle), np.sin(middle)))
     gap = chord @ length
@@ -183,9 +186,9 @@ def _closing_lengths(length: FloatArray, turn: FloatArray, heading: float) -> Fl
 
 
 def write_centre_line(track: Track, step: float, path: Path) -> int:
-    """Write `s,x,y,z,ang,curv`, a row every `step` metres of a lap; returns the number of rows.
+    """Write `s,x,y,z,ang,curv` of one lap, a row every `step` m; returns the number of rows.
 
-    An older file stays as it is until the new one is complete.
+    An existing file is replaced only when the new one is complete.
     """
     if not STEP_LIMITS_M[0] <= step <= STEP_LIMITS_M[1]:
         raise UserError(f"step {step:g} m asked for; it must be {STEP_LIMITS_M[0]:g} to 1000 m")

@@ -86,7 +86,7 @@ def export(
 
 
 def describe(track: "Track") -> dict[str, str | float]:
-    """The entry of one track in `tracks --json`; metres."""
+    """Return the entry of one track in `tracks --json`; lengths in metres."""
     return {
         "name": track.name,
         "source": track.source,

@@ -4,8 +4,8 @@ from trackfeatures.errors import UserError
 
 
 class UnknownTrack(UserError):
-    """No track of that name was found."""
+    """Raised if no track of this name is found."""
 
 
 class TrackError(UserError):
-    """A track file cannot be read, or does not describe a closed road."""
+    """Raised if a track file cannot be read or does not describe a closed road."""

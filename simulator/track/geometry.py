@@ -1,7 +1,8 @@
-"""A track: a closed centre line of constant-curvature pieces, with both edges' heights.
+"""A track: a closed centre line of pieces with constant curvature, with the heights of both edges.
 
-World frame: x, y in the plane, z up. s in metres along the centre line in driving direction,
-y and to_middle in metres, left positive; headings in radians, counter-clockwise.
+World frame: x, y in the plane, z up, metres. s is the distance along the centre line in driving
+direction, y and to_middle are offsets to the left, in metres. Headings are in rad,
+counter-clockwise.
 """
 
 import hashlib
@@ -21,18 +22,19 @@ from simulator.track.pieces import Placed
 Source = Literal["own", "torcs", "csv"]
 Surface = Literal["asphalt", "gravel", "concrete"]
 _UNDECODABLE = re.compile(r"[\ud800-\udfff]")
-"""The surrogates to which Python decodes bytes of a file name that are not UTF-8."""
+"""Surrogates to which Python decodes those bytes of a file name that are not UTF-8."""
 
 
 def readable_name(name: str) -> str:
-    """The name of the track in the file `name`. Bytes that are not UTF-8 become U+FFFD, because
-    names are drawn, recorded and sent as text."""
+    """Return the name of the track in the file `name`. Bytes that are not UTF-8 become U+FFFD,
+    because names are drawn, recorded and sent as text."""
     return _UNDECODABLE.sub("\N{REPLACEMENT CHARACTER}", name)
 
 
 @dataclass(frozen=True)
 class TrackPose:
-    """Points of the road plane; arrays of one shape, heading in (-pi, pi]."""
+    """Points of the road plane, arrays of one shape: m, heading in (-pi, pi] rad, curvature in
+    1/m."""
 
     x: FloatArray
     y: FloatArray
@@ -43,16 +45,16 @@ class TrackPose:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One track. Arrays are (P,), one entry per piece, in driving order; the last piece ends where
-    the first begins (an imported track may miss it by up to 0.28 m)."""
+    """One track. Its arrays (P,) have one entry per piece, in driving order. The last piece ends
+    where the first begins (an imported track may have a gap of up to 0.28 m)."""
 
     name: str
     source: Source
     width: float
-    """The track's own full width, m; a road laid on it may be wider (see `road.Road`)."""
+    """The track's own full width, m; a road on the track may be wider (see `road.Road`)."""
     surface: Surface
     look: str
-    """Scenery style: highway, mountain, circuit, oval, town, forest, coast, gravel, countryside."""
+    """Name of the scenery theme, such as "highway" or "forest"."""
     markings: MarkingStyle
     s0: FloatArray
     length: FloatArray
@@ -80,7 +82,7 @@ class Track:
         markings: MarkingStyle,
         definition_hash: str = "",
     ) -> Self:
-        """Build a track from pieces put end to end."""
+        """Build a track from pieces placed end to end."""
         arrays = [getattr(placed, field.name) for field in fields(Placed) if field.name != "end"]
         track = cls(name, source, width, surface, look, markings, *arrays)
         return replace(track, definition_hash=definition_hash)
@@ -92,19 +94,19 @@ class Track:
 
     @property
     def min_radius_m(self) -> float:
-        """Smallest centre-line radius of a piece, m; infinite without a bend."""
+        """Smallest radius of the centre line, m; infinite if there is no bend."""
         sharpest = float(np.max(np.abs(self.curvature0)))
         return 1.0 / sharpest if sharpest > 0.0 else float("inf")
 
     @property
     def z_range_m(self) -> float:
-        """Highest minus lowest centre-line height, m."""
+        """Difference between highest and lowest point of the centre line, m."""
         heights = np.concatenate((self.z_left0 + self.z_right0, self.z_left1 + self.z_right1)) / 2
         return float(np.ptp(heights))
 
     @property
     def grade_range(self) -> tuple[float, float]:
-        """Steepest fall and rise of the centre line in driving direction (min, max), as dz/ds."""
+        """Least and greatest slope dz/ds of the centre line in driving direction."""
         rise = (self.z_left1 + self.z_right1 - self.z_left0 - self.z_right0) / 2
         grade = rise / self.length
         return float(grade.min()), float(grade.max())
@@ -138,11 +140,11 @@ class Track:
         return table
 
     def arrays(self) -> FloatArray:
-        """The C-contiguous (P, 16) table that the functions of `piece_table` take."""
+        """Return the C-contiguous table (P, 16) that the functions of `piece_table` take."""
         return self._table
 
     def at(self, s: ArrayLike, y: ArrayLike = 0.0) -> TrackPose:
-        """Points of the road plane at (s, y); both broadcast, s wraps round the lap."""
+        """Return the road plane's points at (s, y) in m; both broadcast, s wraps round the lap."""
         distance, offset = np.broadcast_arrays(
             np.asarray(s, dtype=np.float64), np.asarray(y, dtype=np.float64)
         )
@@ -164,10 +166,10 @@ class Track:
         )
 
     def project(self, x: float, y: float, hint_s: float | None = None) -> tuple[float, float]:
-        """Track coordinates (s, to_middle) of a world point.
+        """Return the track coordinates (s, to_middle) in m of a world point (m).
 
-        Without `hint_s` the whole centre line is searched; with it, only the part near that s: this
-        distinguishes a bridge from the road below.
+        Without `hint_s` the whole centre line is searched. With it, only the part near that s is
+        searched, which distinguishes a bridge from the road below it.
         """
         table = self.arrays()
         hint = -1 if hint_s is None else piece_table.index_at(table, float(hint_s))
@@ -175,16 +177,17 @@ class Track:
         return float(s), float(to_middle)
 
     def heading(self, s: float) -> float:
-        """Tangent direction at s, rad in (-pi, pi]."""
+        """Return the direction of the tangent at s, rad in (-pi, pi]."""
         _, _, _, heading, _ = piece_table.pose_at(self.arrays(), float(s))
         return float(wrap_angle(np.float64(heading)))
 
     def curvature(self, s: float) -> float:
-        """Signed curvature at s (left positive), 1/m; s wraps. `at` is the vectorised version."""
+        """Return the signed curvature (1/m, left positive) at s, which wraps. For arrays use
+        `at`."""
         return float(self.curvature0[piece_table.index_at(self.arrays(), float(s))])
 
     def slope(self, s: float) -> float:
-        """Rise of the centre line per metre of s at s (dz/ds, uphill positive)."""
+        """Return the slope dz/ds of the centre line at s, uphill positive."""
         i = piece_table.index_at(self.arrays(), float(s))
         rise = self.z_left1[i] + self.z_right1[i] - self.z_left0[i] - self.z_right0[i]
         return float(rise / 2.0 / self.length[i])
@@ -198,5 +201,5 @@ class Track:
 
 
 def wrap_angle(angle: FloatArray | np.float64) -> FloatArray:
-    """Angles brought into (-pi, pi]."""
+    """Wrap angles (rad) into (-pi, pi]."""
     return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)

@@ -1,6 +1,6 @@
 """Converts straights and bends to the pieces of a closed loop, with spirals, banking and heights.
 
-Metres and radians; a bend's angle is left positive; grades are dz/ds.
+Metres and radians; the angle of a bend is left positive; grades are dz/ds.
 """
 
 import math
@@ -30,31 +30,32 @@ class Bend:
 
     radius: float
     angle: float
-    """Turn of the whole bend, spirals included."""
+    """Turn of the whole bend, including its spirals."""
     spiral: float
     banking: float
-    """Outer edge up; grows along the spiral as the curvature does."""
+    """Lateral slope angle, outer edge up; it grows along the spiral like the curvature."""
     grade: float
 
 
 Segment = Straight | Bend
 Row = tuple[float, float, float, int]
-"""Length, curvature, banking at the end (left edge up), number of the segment."""
+"""Length, curvature, banking at the end (left edge up), and index of the segment of one step."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Cut segments, (n,) arrays: length, curvature, and banking (left edge up) at each end."""
+    """Steps cut from segments, (n,) arrays: length, curvature, banking (left edge up) at the
+    end."""
 
     length: FloatArray
     curvature: FloatArray
     banking_end: FloatArray
     segment: NDArray[np.int64]
-    """Index of the segment each step was cut from."""
+    """Index of the segment from which each step was cut."""
 
 
 def cut(segments: list[Segment]) -> Steps:
-    """Cut segments into steps of at most 5 m, spirals into steps of about 2 m."""
+    """Cut segments into steps of at most 5 m, and spirals into steps of at most 2 m."""
     rows: list[Row] = []
     for number, segment in enumerate(segments):
         if isinstance(segment, Straight):
@@ -67,7 +68,7 @@ def cut(segments: list[Segment]) -> Steps:
         rows += ramp
         if arc > 0.0:
             rows += _even(arc, k, -sign * segment.banking, number)
-        # The exit spiral is the entry spiral reversed: a step ends with the banking it began with.
+        # The exit spiral is the entry spiral reversed, so each step ends with its former start.
         starts = [0.0] + [banking for _, _, banking, _ in ramp[:-1]]
         rows += [
             (length, curvature, start, number)
@@ -86,7 +87,7 @@ def _even(length: float, k: float, banking: float, number: int) -> list[Row]:
 
 def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
     count = math.ceil(bend.spiral / SPIRAL_STEP_M - 1e-9)
-    # Curvature at the middle of a step: the sum of the turns is then exactly the clothoid's.
+    # With the curvature at the middle of each step, the sum of the turns is the clothoid's.
     return [
         (
             bend.spiral / count,
@@ -99,16 +100,17 @@ def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
 
 
 def place(steps: Steps) -> Placed:
-    """The steps in the plane, without heights. No step is long enough to need splitting."""
+    """Place the steps in the plane, without heights. No step is so long that it must be split."""
     return put(steps.length, steps.curvature, np.zeros((len(steps.length), 4)))
 
 
 def close(segments: list[Segment]) -> tuple[list[Segment], float]:
-    """Change the straights' lengths, as little as possible, so that the loop closes in the plane.
+    """Change the lengths of the straights as little as possible, so that the loop closes in the
+    plane.
 
-    The end point is linear in the lengths of straights, so one minimum-norm step is exact.
-    Returns the segments and the largest change made (m). Raises TrackError when no change of the
-    straights can close the loop.
+    The end point is linear in the lengths of the straights, so one minimum-norm solution is exact.
+    Returns the segments and the largest change (m). Raises TrackError if no change of the straights
+    can close the loop.
     """
     placed = place(cut(segments))
     bounds = np.concatenate(([0.0], np.cumsum([segment_length(s) for s in segments])))
@@ -134,23 +136,24 @@ def close(segments: list[Segment]) -> tuple[list[Segment], float]:
 
 
 def segment_length(segment: Segment) -> float:
-    """Length of a segment along the centre line: a bend's spirals add one spiral length."""
+    """Return the length (m) of a segment along the centre line. The two spirals of a bend together
+    add the length of one spiral to the arc's."""
     if isinstance(segment, Straight):
         return segment.length
     return abs(segment.angle) * segment.radius + segment.spiral
 
 
 def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> FloatArray:
-    """Centre-line heights (n,) at `s` in [0, L], zero at the start of the lap.
+    """Return the heights (n,) of the centre line at `s` in [0, L], zero at the start of the lap.
 
-    Grades are shifted by their mean, so that the lap ends where it began, and averaged over
-    `vertical_curve` metres: parabolic crests and dips, as on a real road.
+    The mean grade is subtracted, so that the lap ends at the height of its start. The grades are
+    averaged over `vertical_curve` metres, which gives parabolic crests and dips as on real roads.
     """
     lengths = np.array([segment_length(segment) for segment in segments])
     grades = np.array([segment.grade for segment in segments])
     total = float(lengths.sum())
     grades = grades - float(np.sum(grades * lengths)) / total
-    # Three laps end to end, so that the average near the start sees the end of the lap before.
+    # Three laps end to end, so that the average near the start includes the end of the lap before.
     grades3, lengths3 = np.tile(grades, 3), np.tile(lengths, 3)
     node = np.concatenate(([0.0], np.cumsum(lengths3))) - total
     z = np.concatenate(([0.0], np.cumsum(grades3 * lengths3)))
@@ -164,7 +167,7 @@ def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> Fl
 
     half = vertical_curve / 2.0
     smooth = (integral(s + half) - integral(s - half)) / vertical_curve
-    # Equal except for rounding; the last height must be the first.
+    # Without rounding, the last height equals the first.
     if abs(s[-1] - total) < 1e-6:
         smooth[-1] = smooth[0]
     result: FloatArray = smooth - smooth[0]
@@ -172,7 +175,7 @@ def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> Fl
 
 
 def lay(segments: list[Segment], width: float, vertical_curve: float) -> list[Piece]:
-    """The pieces of a closed list of segments (see `close`)."""
+    """Return the pieces of a closed list of segments (see `close`); `width` of the track in m."""
     steps = cut(segments)
     s = np.concatenate(([0.0], np.cumsum(steps.length)))
     z = heights(segments, s, vertical_curve)

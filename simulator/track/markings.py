@@ -9,23 +9,23 @@ LineColour = Literal["white", "yellow"]
 
 @dataclass(frozen=True)
 class MarkingStyle:
-    """Paint of one track: outer lines are solid, lane dividers dashed."""
+    """Paint of one track: outer lines are solid, lane dividers are dashed."""
 
     line_width: float = 0.12
     """Width of a line, 0.11 to 0.15 m."""
     dash_length: float = 4.0
     dash_gap: float = 8.0
     left_colour: LineColour = "white"
-    """Colour of the leftmost line; all others are white."""
+    """Colour of the leftmost line; all other lines are white."""
     kerbs: bool = False
-    """Red and white kerbs beside the asphalt in bends."""
+    """Whether bends have red and white kerbs beside the asphalt."""
     wear: float = 0.0
-    """0: fresh paint; 1: all of it worn away in patches."""
+    """Share of the paint that is worn away in patches: 0 is fresh paint, 1 no paint."""
 
 
 def imported_style(name: str, *, kerbs: bool) -> MarkingStyle:
-    """A random style whose seed is the name of the track, for files without information on
-    paint."""
+    """Return a random style for a track file without information on paint; the track's name is the
+    seed."""
     draw = hashlib.sha256(name.encode()).digest()
     dash_length, dash_gap = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))[draw[1] % 4]
     return MarkingStyle(

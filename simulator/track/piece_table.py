@@ -1,6 +1,6 @@
-"""Compiled functions on the table of a track: (P, 16), one row per constant-curvature piece.
+"""Compiled functions on the table (P, 16) of a track, with one row per piece of constant curvature.
 
-A piece is a straight or an arc of the centre line with edge heights linear in its arc length.
+A piece is a straight or an arc of the centre line; its edge heights are linear in the arc length.
 World frame (x, y plane, z up); s along the centre line, to_middle left positive; metres, radians.
 """
 
@@ -22,17 +22,18 @@ COS0, SIN0, LEFT_SLOPE, RIGHT_SLOPE = 12, 13, 14, 15
 COLUMNS = 16
 
 MAX_WALK = 64
-"""Pieces by which a hint can be wrong before all pieces are searched."""
+"""Largest number of pieces that a search walks from the hint before all pieces are searched."""
 HINT_REACH_M = 40.0
-"""A foot point farther away than this is not trusted to be on the hinted part of the track."""
+"""A foot point farther away may belong to another part of the track than the hinted one."""
 
 
 @inlined
 def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
-    """Foot point of (x, y) on piece `index`, extended beyond both ends: (local s, to_middle).
+    """Return the foot point of (x, y) on piece `index`, extended beyond both ends: (local s,
+    to_middle).
 
-    Exact on arcs and free of cancellation as the curvature goes to zero. A piece turns at most
-    a quarter circle (see `pieces.assemble`), so the angle never wraps near it.
+    The formula is exact on arcs, without cancellation as the curvature approaches 0. A piece turns
+    by at most a quarter circle (see `pieces.assemble`), so the angle never wraps near it.
     """
     dx = x - table[index, X0]
     dy = y - table[index, Y0]
@@ -48,7 +49,7 @@ def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
 
 @compiled
 def centre_point(table: Table, index: int, along: float) -> tuple[float, float]:
-    """Point (x, y) of the centre line `along` metres into piece `index`."""
+    """Return the point (x, y) of the centre line `along` metres from the start of piece `index`."""
     half_turn = 0.5 * along * table[index, CURVATURE]
     chord = along
     if half_turn != 0.0:
@@ -72,7 +73,7 @@ def complete_table(table: Table) -> None:
 
 @compiled
 def index_at(table: Table, s: float) -> int:
-    """Index of the piece that holds `s`; s wraps round the lap."""
+    """Return the index of the piece that contains `s`; s wraps round the lap."""
     wrapped = wrap(table, s)
     index = int(np.searchsorted(table[:, S0], wrapped, side="right")) - 1
     return max(index, 0)
@@ -80,7 +81,7 @@ def index_at(table: Table, s: float) -> int:
 
 @compiled
 def index_near(table: Table, s: float, hint: int) -> int:
-    """`index_at`, faster if `s` is on piece `hint` or on one of the next."""
+    """Return `index_at(table, s)`; this is faster if `s` is on piece `hint` or one of the next."""
     wrapped, count = wrap(table, s), table.shape[0]
     for index in range(hint, min(hint + MAX_WALK, count)):
         if wrapped < table[index, S0]:
@@ -92,7 +93,7 @@ def index_near(table: Table, s: float, hint: int) -> int:
 
 @inlined
 def wrap(table: Table, s: float) -> float:
-    """`s` brought into [0, track length)."""
+    """Wrap `s` into [0, track length)."""
     total = table[0, TRACK_LENGTH]
     wrapped = s - total * math.floor(s / total)
     return wrapped if wrapped < total else 0.0
@@ -100,13 +101,14 @@ def wrap(table: Table, s: float) -> float:
 
 @compiled
 def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, float]:
-    """Nearest point of the whole centre line, as `locate`; the first of equally near ones."""
+    """Find the nearest point of the whole centre line; returns the same as `locate`. Of equally
+    near points the first is used."""
     best, best_s, best_d, best_squared = 0, 0.0, 0.0, math.inf
     for index in range(table.shape[0]):
         reach = table[index, LENGTH]
         dx = x - table[index, X0]
         dy = y - table[index, Y0]
-        # No point of a piece is farther from its start than its length.
+        # No point of a piece is farther from the piece's start than the piece's length.
         if best_squared < math.inf:
             start_distance = math.sqrt(dx * dx + dy * dy)
             if start_distance > reach + math.sqrt(best_squared):
@@ -124,11 +126,11 @@ def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, flo
 
 @inlined
 def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, float, float]:
-    """Track coordinates of a world point: (piece index, s, to_middle).
+    """Return the track coordinates of a world point: (piece index, s, to_middle).
 
-    With `hint_index` >= 0 the search walks from that piece to its neighbours, so that a car
-    under a bridge stays on its own road; -1, a hint too far off, or a point beyond the centre
-    of a bend, searches the whole track. s is in [0, track length).
+    With `hint_index` >= 0 the search walks from that piece to its neighbours, so that a car under a
+    bridge stays on its own road. With -1, a hint too far off, or a point beyond the centre of a
+    bend, the whole track is searched. s is in [0, track length).
     """
     count = table.shape[0]
     if hint_index < 0 or hint_index >= count:
@@ -142,7 +144,7 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
             move = -1
         elif along > length:
             move = 1
-        # Turning back means the point lies in the joint between two pieces.
+        # If the search turns back, the point lies in the joint between two pieces.
         if move == 0 or move == -last_move:
             along = min(max(along, 0.0), length)
             if abs(d) > HINT_REACH_M or d * table[index, CURVATURE] >= 1.0:
@@ -157,9 +159,9 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
 def surface(
     table: Table, index: int, s: float, to_middle: float
 ) -> tuple[float, float, float, float]:
-    """Height and unit normal (z, nx, ny, nz) of the road plane at (s, to_middle) on a piece.
+    """Return height and unit normal (z, nx, ny, nz) of the road plane at (s, to_middle) on a piece.
 
-    Beyond the track's width the banking plane continues.
+    Beyond the track's width the banked plane continues.
     """
     length = table[index, LENGTH]
     along = min(max(s - table[index, S0], 0.0), length)
@@ -170,7 +172,7 @@ def surface(
     across = (left - right) / width
     share = to_middle / width
     k = table[index, CURVATURE]
-    # A metre of s is (1 - k y) metres on the ground at offset y.
+    # At offset y, 1 m of s is (1 - k y) m on the ground.
     stretch = max(1.0 - k * to_middle, 0.05)
     slope = (0.5 * (left_slope + right_slope) + share * (left_slope - right_slope)) / stretch
     heading = table[index, HEADING0] + k * along
@@ -187,7 +189,7 @@ def surface(
 
 @compiled
 def foot_offset(table: Table, index: int, s: float, to_middle: float, z: float) -> float:
-    """Lateral offset (m) of the foot on the road plane of a point at (s, to_middle, z).
+    """Return the lateral offset (m) of the foot of a point at (s, to_middle, z) on the road plane.
 
     The foot is the nearest point of the road plane. On a banked road it does not lie vertically
     below the point, but further up the bank.
@@ -201,7 +203,8 @@ def foot_offset(table: Table, index: int, s: float, to_middle: float, z: float) 
 
 @compiled
 def pose_at(table: Table, s: float) -> tuple[float, float, float, float, float]:
-    """Centre-line pose (x, y, z, heading, curvature) at `s`; s wraps, heading is unwrapped."""
+    """Return the centre line's pose (x, y, z, heading, curvature) at `s`, which wraps; heading does
+    not."""
     index = index_at(table, s)
     wrapped = wrap(table, s)
     along = wrapped - table[index, S0]
@@ -215,7 +218,8 @@ def pose_at(table: Table, s: float) -> tuple[float, float, float, float, float]:
 def road_points(
     table: Table, distances: NDArray[np.float64], offsets: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points (offsets, distances, 3) of the road plane; `distances` along s wrap round the lap."""
+    """Return points (offsets, distances, 3) of the road plane at all pairs of `offsets` (m) and
+    `distances` along s (m), which wrap round the lap."""
     points = np.empty((offsets.shape[0], distances.shape[0], 3))
     for i in range(distances.shape[0]):
         index = index_at(table, distances[i])

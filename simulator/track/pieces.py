@@ -1,4 +1,4 @@
-"""Converts lengths, curvatures and edge heights to placed constant-curvature pieces.
+"""Places pieces of constant curvature end to end, from their lengths, curvatures and edge heights.
 
 Lengths in metres, curvature in 1/m (left positive), headings in radians counter-clockwise.
 """
@@ -13,16 +13,16 @@ from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
 
 MAX_TURN: Final = math.pi / 2
-"""No piece turns farther, so that a foot point on an arc is unique near it."""
+"""Largest turn of a piece, rad; up to it, the foot point on an arc is unique near the arc."""
 MAX_GAP_M: Final = 0.28
 """Largest gap between the last piece and the first. Of the 38 tracks of TORCS 1.3.7 all but two
-close within 0.09 m; forza has a gap of 0.152 m, wheel-2 of 0.262 m. TORCS drives over them, too."""
+close within 0.09 m; forza has a gap of 0.152 m, wheel-2 of 0.262 m. TORCS accepts both."""
 MAX_HEADING_GAP: Final = math.radians(0.5)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One step of a centre line, with the heights of both edges at its ends."""
+    """One piece of a centre line, with the heights of both edges at its start (0) and end (1)."""
 
     length: float
     curvature: float
@@ -34,7 +34,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Placed:
-    """Pieces put end to end in the plane, all arrays (P,), and where the last one ends."""
+    """Pieces placed end to end in the plane, all arrays (P,), and the end of the last piece."""
 
     s0: FloatArray
     length: FloatArray
@@ -47,11 +47,11 @@ class Placed:
     z_left1: FloatArray
     z_right1: FloatArray
     end: tuple[float, float, float]
-    """x, y, heading (unwrapped) at the end of the last piece."""
+    """x, y (m) and unwrapped heading (rad) at the end of the last piece."""
 
 
 def split_turns(pieces: list[Piece]) -> list[Piece]:
-    """Cut every piece that turns more than `MAX_TURN` into equal ones; heights stay linear."""
+    """Cut every piece that turns by more than `MAX_TURN` into equal parts; heights stay linear."""
     cut: list[Piece] = []
     for piece in pieces:
         parts = max(1, math.ceil(abs(piece.curvature) * piece.length / MAX_TURN - 1e-9))
@@ -78,7 +78,7 @@ def _between(start: float, end: float, share: float) -> float:
 
 
 def assemble(pieces: list[Piece], x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Placed:
-    """Place pieces end to end, tangent to tangent, from the pose (x, y, heading)."""
+    """Place pieces end to end, with continuous tangents, from the pose (x, y, heading)."""
     cut = split_turns(pieces)
     length = np.array([piece.length for piece in cut], dtype=np.float64)
     curvature = np.array([piece.curvature for piece in cut], dtype=np.float64)
@@ -94,11 +94,11 @@ def put(
     y: float = 0.0,
     heading: float = 0.0,
 ) -> Placed:
-    """Pieces (P,) that turn by at most `MAX_TURN` put end to end from the pose (x, y, heading);
-    `heights` (P, 4) of the left and right edge at the start, and at the end."""
+    """Place pieces (P,) that turn by at most `MAX_TURN` end to end from the pose (x, y, heading).
+    `heights` (P, 4) are those of the left and right edge at the start, then at the end."""
     turn = curvature * length
     headings = heading + np.concatenate(([0.0], np.cumsum(turn)))
-    # np.sinc(t) = sin(pi t)/(pi t): the chord of an arc that turns by `turn`.
+    # np.sinc(t) = sin(pi t)/(pi t) gives the chord of an arc that turns by `turn`.
     chord = length * np.sinc(turn / (2.0 * np.pi))
     middle = headings[:-1] + turn / 2.0
     xs = x + np.concatenate(([0.0], np.cumsum(chord * np.cos(middle))))
@@ -119,7 +119,7 @@ def put(
 
 
 def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> None:
-    """Raise TrackError unless the end of the last piece meets the start of the first."""
+    """Raises TrackError unless the end of the last piece meets the start of the first."""
     x, y, heading = placed.end
     gap = math.hypot(x - placed.x0[0], y - placed.y0[0])
     height = max(
@@ -127,7 +127,7 @@ def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> Non
     )
     turn = heading - float(placed.heading0[0])
     advice = "a track must be one closed loop, so correct its last segments"
-    # Written so that NaN fails as well.
+    # The comparisons are negated, so that NaN raises as well.
     if not gap <= max_gap_m:
         raise TrackError(f"{what}: the segments end {gap:.2f} m from their start; {advice}")
     if not abs(math.remainder(turn, 2.0 * math.pi)) <= MAX_HEADING_GAP:

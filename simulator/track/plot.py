@@ -1,4 +1,4 @@
-"""A picture of a track: its plan, and height, curvature and class of the road along the lap.
+"""Draws a picture of a track: its plan, and height, curvature and class of the road along the lap.
 
 simulator tracks plot NAME --out FILE.png --lanes 2
 """
@@ -39,7 +39,7 @@ DPI: Final = 110
 
 @dataclass(frozen=True)
 class Lap:
-    """A road sampled evenly round the lap, both ends included; all arrays (N,)."""
+    """A road sampled evenly round the lap, including both ends; all arrays (N,)."""
 
     road: Road
     s: FloatArray
@@ -54,7 +54,7 @@ class Lap:
 
 
 def sample(road: Road) -> Lap:
-    """The lap of `road`, sampled every metre; a long lap has 6000 samples."""
+    """Sample the lap of `road` every metre, or at 6000 points if the lap is longer than 6 km."""
     track = road.track
     count = min(round(track.length_m), MOST_SAMPLES)
     s = np.linspace(0.0, track.length_m, count + 1)
@@ -68,7 +68,7 @@ def sample(road: Road) -> Lap:
 
 
 def runs(classes: NDArray[np.int64]) -> list[tuple[int, int, tf.RoadClass]]:
-    """Stretches of one class: (first sample, last sample + 1, class)."""
+    """Return the stretches of one class as (first sample, last sample + 1, class)."""
     cuts = np.flatnonzero(np.diff(classes)) + 1
     bounds = [0, *cuts.tolist(), len(classes)]
     return [(first, last, tf.RoadClass(int(classes[first]))) for first, last in pairwise(bounds)]
@@ -77,8 +77,8 @@ def runs(classes: NDArray[np.int64]) -> list[tuple[int, int, tf.RoadClass]]:
 def write_plot(road: Road, out: Path) -> None:
     """Write the picture of `road` as a PNG file of 1760 x 990 pixels.
 
-    An older file is kept until the new one is complete. Raises UserError for a name without .png,
-    a missing folder or missing matplotlib, OSError if the file cannot be written.
+    An existing file is replaced only when the new one is complete. Raises UserError for a name
+    without .png, a missing folder or missing matplotlib, and OSError if the file cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the plot is a PNG file; give a name that ends in .png")
@@ -89,7 +89,7 @@ def write_plot(road: Road, out: Path) -> None:
 
 
 def draw(lap: Lap) -> "Figure":
-    """The figure, made without a window, a display or matplotlib's global state."""
+    """Draw the figure without a window, a display or matplotlib's global state."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -144,7 +144,7 @@ def _plan(axes: "Axes", lap: Lap) -> None:
 
 
 def _distances(axes: "Axes", lap: Lap) -> None:
-    """Ticks across the road with their distance, on the outer side of the loop."""
+    """Draw ticks across the road with their distances, on the outer side of the loop."""
     from matplotlib.patheffects import withStroke
 
     track = lap.road.track
@@ -180,12 +180,12 @@ def _point(xy: FloatArray) -> tuple[float, float]:
 
 
 def tick_step(length: float) -> int:
-    """A round distance (m) between ticks, so that there are at most 16."""
+    """Return a round distance (m) between ticks that gives at most 16 of them."""
     return next((step for step in TICKS_M if length / step <= MOST_TICKS), 10_000)
 
 
 def _start(axes: "Axes", lap: Lap) -> None:
-    """The start line, and an arrow beside it in driving direction."""
+    """Draw the start line and, beside it, an arrow in driving direction."""
     track = lap.road.track
     span = float(max(np.ptp(lap.centre.x), np.ptp(lap.centre.y)))
     turned = float(np.sum(track.curvature0 * track.length))
@@ -249,7 +249,7 @@ def _classes(axes: "Axes", lap: Lap) -> None:
 
 
 def _cross_section(axes: "Axes", road: Road) -> None:
-    """The road in the driver's view: left is left, heights are not to scale."""
+    """Draw the road's cross-section as the driver sees it: left is left, heights not to scale."""
     wall, edge, asphalt = road.wall_offset, road.edge, road.half_asphalt
     axes.axvspan(-wall, wall, ymax=0.35, color=GRASS, lw=0)
     axes.axvspan(-asphalt, asphalt, ymax=0.35, color=ASPHALT, lw=0)

@@ -1,4 +1,4 @@
-"""The road laid on a track: lanes, asphalt and where it ends. Metres, left positive."""
+"""The road along a track: its lanes, its asphalt and its edges. Metres, left positive."""
 
 from dataclasses import dataclass
 
@@ -11,21 +11,21 @@ from simulator.varied.carriageway import Carriageway
 from trackfeatures.errors import UserError
 
 START_BEFORE_LINE_M = 25.0
-"""Distance from the start of a drive to the line."""
+"""Distance from the start of a drive to the start line."""
 SHOULDER_M = 1.0
 """Width of the asphalt beyond the outermost marking."""
 WALL_MARGIN_M = 2.5
-"""Distance from the edge to the rails and walls: half a car's diagonal (2.46 m), so that a car has
-left the track before any part of it meets a wall."""
+"""Distance from the edge to the rails and walls. It exceeds half of a car's diagonal (2.46 m), so
+that a car has left the track before any part of it touches a wall."""
 
 
 @dataclass(frozen=True)
 class Road:
-    """`lanes` lanes of `lane_width`, centred on `track`; a narrower track is widened.
+    """`lanes` lanes of width `lane_width` (m), centred on `track`; a narrower track is widened.
 
-    `carriageway`: the lines and shoulders of a varied road; None: the paper's lines and shoulders,
-    with one line per marking. Raises UserError for a number or width of lanes outside the
-    definitions, or that differs from the carriageway's.
+    `carriageway` contains the lines and shoulders of a varied road. With None the road has the
+    paper's shoulders and one line per marking. Raises UserError for a number or width of lanes
+    outside the definitions, or different from the carriageway's.
     """
 
     track: Track
@@ -44,13 +44,13 @@ class Road:
 
     @staticmethod
     def varied(track: Track, carriageway: Carriageway) -> "Road":
-        """The road of a carriageway on `track`."""
+        """Return the road of a carriageway on `track`."""
         lanes = len(carriageway.markings) - 1
         return Road(track, lanes, carriageway.lane_width_m, carriageway)
 
     @property
     def half_width(self) -> float:
-        """`w`: half of the track's own width; scales reward and state, and is the least `edge`."""
+        """Half of the track's own width (`w` of reward and state); the least value of `edge`."""
         return self.track.width / 2
 
     @property
@@ -81,8 +81,8 @@ class Road:
         return tf.marking_offsets(self.lanes, self.lane_width)
 
     def lines_y(self, to_middle: float) -> NDArray[np.float64]:
-        """Lateral positions (lanes + 1,) of the lines that count for a car at `to_middle`: for a
-        double line, the position of the line nearer to the car's lane."""
+        """Return the lateral positions (lanes + 1,) of the lines that bound lanes for a car at
+        `to_middle`. Of a double line, it is the line nearer to the car's lane."""
         if not self.line_offsets:
             return self.markings_y
         lane = tf.lane_index(to_middle, self.lanes, self.lane_width)
@@ -91,7 +91,7 @@ class Road:
         return self.markings_y + np.where(right_of, offsets[:, 0], offsets[:, 1])
 
     def measure(self, s: float, to_middle: float, angle: float) -> tf.TrackFeatures:
-        """True track features of a car at (s, to_middle) with heading angle `angle` (rad)."""
+        """Return the true track features of a car at (s, to_middle) m with `angle` in rad."""
         curvature = self.track.curvature(s)
         ahead = self.track.curvature(s + tf.LOOK_AHEAD_M)
         return tf.measure(
@@ -100,7 +100,7 @@ class Road:
 
     @property
     def line_offsets(self) -> tuple[tuple[float, float], ...]:
-        """Offsets, left positive, from each marking to the lines that bound the lanes on its left
+        """For each marking, offsets (left positive) to the lines that bound the lanes on its left
         and on its right; empty if all of them are 0."""
         if self.carriageway is None:
             return ()

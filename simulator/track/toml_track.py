@@ -1,16 +1,16 @@
-"""Reads the project's own track format: a TOML list of straights and bends.
+"""Reads the project's own track format, a TOML list of straights and bends.
 
     name, look, surface, width (m), vertical_curve (m)
     [markings]   the fields of `MarkingStyle`
     [[segment]]  type = "straight", length (m)
     [[segment]]  type = "bend", radius (m), angle (deg, left positive, spirals included),
                  spiral (m, each end), banking (deg, outer edge up)
-    grade (%, uphill positive) on a segment holds until another one is given.
+    grade (%, uphill positive) of a segment holds until a later segment sets another one.
     hash         "segments": the track's hash is that of the numbers in the file, which are the same
                  on every machine; "geometry" (default): that of the pieces computed from them
 
-The bends must turn by +-360 degrees in all. Straights are adjusted by up to a metre so that the
-loop closes exactly, and the mean grade is taken out so that the heights close too.
+The bends must turn by +-360 degrees in total. Straights are adjusted by up to a metre so that the
+loop closes exactly. The mean grade is subtracted so that the heights close too.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ from simulator.track.pieces import assemble, check_closes
 
 MAX_BYTES: Final = 2**20
 MAX_CORRECTION_M: Final = 1.0
-"""Largest change of a straight to close the loop; a larger one would not be the author's road."""
+"""Largest change of a straight to close the loop; a larger change would give a different road."""
 MAX_GAP_M: Final = 1e-3
 LOOKS: Final = (
     "highway",
@@ -49,7 +49,7 @@ LOOKS: Final = (
 
 @dataclass(frozen=True)
 class Table:
-    """A TOML table with its position in the file, which error messages name."""
+    """A TOML table with its position in the file, which error messages contain."""
 
     values: Mapping[str, Any]
     where: str
@@ -69,19 +69,19 @@ class Table:
         return str(value)
 
     def only(self, *keys: str) -> None:
-        """Refuse unknown keys: a misspelt key would silently have no effect."""
+        """Raises TrackError for unknown keys, because a misspelt key would have no effect."""
         for key in self.values:
             if key not in keys:
                 raise TrackError(f"{self.where}: unknown key {key!r}, expected {', '.join(keys)}")
 
 
 def read_toml_track(path: Path) -> Track:
-    """The track of one TOML file, named after the file. Raises TrackError when it is not one."""
+    """Read the track of one TOML file, named after the file. Raises TrackError if it is bad."""
     return build_track(Table(_load(path), str(path)), readable_name(path.stem))
 
 
 def build_track(table: Table, name: str) -> Track:
-    """The track that the content of a TOML file describes. Raises TrackError when it does not."""
+    """Build the track that a TOML file's content describes. Raises TrackError if it is bad."""
     table.only("look", "surface", "width", "vertical_curve", "hash", "markings", "segment")
     width = table.number("width", 6.0, 40.0)
     vertical_curve = table.number("vertical_curve", 1.0, 200.0, 50.0)
@@ -103,10 +103,10 @@ def build_track(table: Table, name: str) -> Track:
 
 
 def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
-    """SHA-256 (hex) of the numbers of a definition.
+    """Return the SHA-256 (hex) of the numbers of a definition.
 
-    The computed geometry differs by 1e-12 m between machines, whose libraries round sines
-    differently; parsed decimals and their products do not differ.
+    The computed geometry differs by 1e-12 m between machines, because their libraries round sines
+    differently. Parsed decimals and their products do not differ.
     """
     rows = [
         (segment.length, 0.0, 0.0, 0.0, segment.grade)
@@ -119,7 +119,7 @@ def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
 
 
 def _closed(written: list[Segment], where: str) -> list[Segment]:
-    """The segments of a closed loop; TrackError where closing changes a straight too much."""
+    """Close the loop of the segments. Raises TrackError if this changes a straight too much."""
     try:
         segments, correction = close(written)
     except TrackError as error:
@@ -135,7 +135,7 @@ def _closed(written: list[Segment], where: str) -> list[Segment]:
 
 
 def read_segments(table: Table) -> list[Segment]:
-    """The segments as written, before the loop is closed; grades carried on."""
+    """Return the segments as written, before the loop is closed. A grade holds until the next."""
     rows = table.values.get("segment")
     if not isinstance(rows, list) or not 3 <= len(rows) <= 1000:
         raise TrackError(f"{table.where}: expected 3 to 1000 [[segment]] tables")
@@ -177,7 +177,7 @@ def _load(path: Path) -> Mapping[str, Any]:
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        # Not only TOMLDecodeError: Python itself refuses an integer of thousands of digits.
+        # ValueError, because Python itself refuses an integer of thousands of digits.
         raise TrackError(f"{path}: not a readable TOML file ({error})") from None
 
 

@@ -1,7 +1,8 @@
-"""C11 atomic loads, stores and fences on numpy arrays, for compiled functions (numba has none).
+"""C11 atomic loads, stores and fences on numpy arrays for compiled functions, because numba has
+none.
 
-Each is one LLVM instruction, so it is correct on every processor, including those that reorder
-memory accesses (ARM). Arrays are of integers, aligned to their item size.
+Each function is one LLVM instruction, so it is correct on every processor, also on processors that
+reorder memory accesses (ARM). The arrays contain integers and are aligned to their item size.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ get_item_pointer: Callable[..., Any] = cgutils.get_item_pointer
 
 
 def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    """Pointer to `array[index]`."""
+    """Build a pointer to `array[index]`."""
     struct = context.make_array(kind)(context, builder, array)
     return get_item_pointer(context, builder, kind, struct, [index])
 

@@ -1,6 +1,7 @@
-"""Wait until a word of shared memory changes: Linux's futex, across processes.
+"""Waits until a word of shared memory changes, with Linux's futex, also between processes.
 
-A signal, or a change before the wait began, ends it early: callers check again in a loop.
+A signal, or a change before the wait began, ends the wait early. Therefore callers check the word
+again in a loop.
 """
 
 import ctypes
@@ -20,7 +21,7 @@ class _Timespec(ctypes.Structure):
 
 
 def check_system() -> None:
-    """Raises LinkError where there are no futexes."""
+    """Raises LinkError if this system has no futexes."""
     if not sys.platform.startswith("linux") or platform.machine() not in _NUMBERS:
         raise LinkError(
             f"the shared-memory link needs Linux on {', '.join(_NUMBERS)}, this is "
@@ -35,7 +36,7 @@ def wait(address: int, value: int, seconds: float) -> None:
 
 
 def wake(address: int) -> None:
-    """Wake all processes waiting on the word at `address`."""
+    """Wake all processes that wait on the word at `address`."""
     _call(address, WAKE, ALL_WAITERS, None)
 
 

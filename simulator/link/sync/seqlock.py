@@ -1,13 +1,14 @@
 """A sequence lock: the writer never waits, and a reader never accepts a torn message.
 
-The sequence is odd during a write, and even, two higher, after it. A reader copies the message
-between two reads of the sequence and discards the copy unless both were the same even number.
-Memory orderings after Boehm, "Can seqlocks get along with programming language memory models?"
-(MSPC 2012): relaxed atomic words, a release fence after the odd store and an acquire fence before
-the second read; correct on all architectures. `c/protocol.h` is the same in C11.
+The sequence number is odd during a write, and even afterwards; each write increases it by two. A
+reader copies the message between two reads of the sequence, and discards the copy unless both reads
+gave the same even number. Memory orderings after Boehm, "Can seqlocks get along with programming
+language memory models?" (MSPC 2012): relaxed atomic words, a release fence after the odd store and
+an acquire fence before the second read. They are correct on all architectures. `c/protocol.h` does
+the same in C11.
 
-Arrays: `sequence` (1,) uint32 and `shared` (n,) uint64 are views of the same shared memory; `local`
-(n,) uint64 is a local copy of the message; word 0 holds the sequence, word n-1 the checksum.
+Arrays: `sequence` (1,) uint32 and `shared` (n,) uint64 are views of the same shared memory. `local`
+(n,) uint64 is a local copy of the message; word 0 is the sequence, word n-1 the checksum.
 `shared_image` and `local_image` (k,) uint64 belong to the same message; k may be 0.
 """
 
@@ -37,7 +38,7 @@ MAX_TRIES = 100
 
 @compiled
 def checksum(message: Words) -> Any:
-    """FNV-1a over words 1 to n-2; a wrong one means that the writer violates the protocol."""
+    """Return the FNV-1a checksum of words 1 to n-2; a wrong one shows a violated protocol."""
     value = FNV_OFFSET
     for i in range(1, message.shape[0] - 1):
         value = (value ^ message[i]) * FNV_PRIME
@@ -48,9 +49,10 @@ def checksum(message: Words) -> Any:
 def publish(
     sequence: Sequence, shared: Words, local: Words, shared_image: Words, local_image: Words
 ) -> None:
-    """Write `local` and its image. Only one process may write; the link's locks ensure it.
+    """Write `local` and its image to the shared memory. Only one process may write; the link's
+    locks ensure that.
 
-    A writer killed during a write leaves an odd sequence; the next one continues from it.
+    A writer killed during a write leaves an odd sequence; the next writer continues from it.
     """
     last = local.shape[0] - 1
     local[last] = checksum(local)
@@ -73,10 +75,10 @@ def try_read(
     local_image: Words,
     seen: int,
 ) -> tuple[int, int]:
-    """Copy the message into `local` if it is complete and newer than sequence `seen`.
+    """Copy the message into `local` if it is complete and newer than the sequence `seen`.
 
-    Returns (NOTHING, READ or DAMAGED; its sequence). Gives up after MAX_TRIES, so it never blocks;
-    after NOTHING or DAMAGED the contents of `local` are undefined.
+    Returns (NOTHING, READ or DAMAGED; sequence of the message). The function gives up after
+    MAX_TRIES, so it never blocks. After NOTHING or DAMAGED the contents of `local` are undefined.
     """
     for _ in range(MAX_TRIES):
         begun = load_acquire(sequence, 0)
@@ -97,7 +99,7 @@ def try_read(
 
 @compiled
 def spin_until_new(sequence: Sequence, seen: int, turns: int) -> Any:
-    """Poll the sequence up to `turns` times until it is even and not `seen`; returns the last one
+    """Poll the sequence up to `turns` times until it is even and not `seen`; returns the last value
     read."""
     current = load_acquire(sequence, 0)
     for _ in range(turns):
@@ -109,7 +111,7 @@ def spin_until_new(sequence: Sequence, seen: int, turns: int) -> Any:
 
 @compiled
 def set_word(word: Sequence, value: int) -> None:
-    """Store a single word with release order: earlier writes are visible before it."""
+    """Store a single word with release order: earlier writes become visible before it."""
     store_release(word, 0, np.uint32(value))
 
 
