@@ -1,6 +1,6 @@
 """Definitions that all packages share: track features (units, signs, ranges, coding) and camera.
 
-The modules that need numpy are imported at their first use, so that `--help` of a command is fast.
+Modules that need numpy are imported at first use, so that `--help` of a command is fast.
 """
 
 from importlib import import_module

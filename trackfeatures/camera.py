@@ -21,7 +21,8 @@ COEFFICIENTS: dict[str, tuple[int, ...]] = {"none": (0,), "opencv": (4, 5, 8), "
 
 
 class CameraError(UserError, ValueError):
-    """Impossible camera parameters. Also a ValueError, which readers of damaged files catch."""
+    """Raised for impossible camera parameters; a ValueError, which readers of damaged files
+    catch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +50,8 @@ class CameraParameters:
     matrix: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy in px. None: square pixels, `fov_y_deg`, principal point in the centre."""
     distortion: str = "none"
-    """Model and its `coefficients`: "none"; "opencv": k1, k2, p1, p2 [, k3 [, k4, k5, k6]];
-    "fisheye": k1 to k4."""
+    """Distortion model; it determines the meaning of `coefficients`. "none": none; "opencv": k1,
+    k2, p1, p2 [, k3 [, k4, k5, k6]]; "fisheye": k1 to k4."""
     coefficients: tuple[float, ...] = ()
     height_std: float = 0.0
     """Standard deviation of the height above the road, as a fraction of that height."""
@@ -111,7 +112,7 @@ class CameraParameters:
         )
 
     def intrinsics(self) -> "NDArray[np.float64]":
-        """Pinhole matrix K (3, 3) in pixels."""
+        """Return the pinhole matrix K (3, 3) in px."""
         import numpy as np  # imported here: `--help` of a command must not load numpy
 
         focal = self.focal_px
@@ -120,7 +121,7 @@ class CameraParameters:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def rotation(self) -> "NDArray[np.float64]":
-        """Rotation matrix (3, 3) from the car's frame to the camera's frame."""
+        """Return the rotation matrix (3, 3) from the car's frame to the camera's frame."""
         from trackfeatures.lens import mount_rotation
 
         return mount_rotation(
@@ -128,8 +129,8 @@ class CameraParameters:
         )
 
     def project(self, points: "ArrayLike") -> "NDArray[np.float64]":
-        """Pixels (N, 2) of points (N, 3) in the car's frame in m. NaN for points behind the camera
-        and for points beyond the angle at which the lens model folds."""
+        """Project points (N, 3) in m in the car's frame to pixels (N, 2). Pixels are NaN for points
+        behind the camera and for points beyond the angle at which the lens model folds."""
         import numpy as np
 
         from trackfeatures.lens import project
@@ -138,15 +139,15 @@ class CameraParameters:
         return project(self, away @ self.rotation().T)
 
     def rays(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
-        """Ray directions (N, 3) of pixels (N, 2) in the camera's frame, with z = 1. NaN where the
-        lens model maps no ray to the pixel."""
+        """Return the ray directions (N, 3), with z = 1, of pixels (N, 2) in the camera's frame. NaN
+        where the lens model maps no ray to the pixel."""
         from trackfeatures.lens import rays
 
         return rays(self, pixels)
 
     def road_points(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
-        """Points (N, 2) on the flat road of pixels (N, 2), in m: x ahead and y left of the point
-        below the centre of gravity. NaN for pixels on or above the horizon."""
+        """Return the points (N, 2) in m on a flat road that pixels (N, 2) show: x ahead and y left
+        of the point below the centre of gravity. NaN for pixels on or above the horizon."""
         import numpy as np
 
         ahead, left, up = (self.rays(pixels) @ self.rotation()).T
@@ -155,8 +156,8 @@ class CameraParameters:
         return np.column_stack([self.x + far * ahead, self.y + far * left])
 
     def homography(self, other: "CameraParameters") -> "NDArray[np.float64]":
-        """Homography (3, 3) from pixels of this camera to pixels of `other`. Exact for any scene if
-        both are in the same place and have no distortion (Hartley and Zisserman 2004, 8.4)."""
+        """Return the homography (3, 3) from pixels of this camera to pixels of `other`. It is exact
+        if both are in one place and have no distortion (Hartley and Zisserman 2004, 8.4)."""
         import numpy as np
 
         turn = other.rotation() @ self.rotation().T
@@ -164,11 +165,11 @@ class CameraParameters:
         return found
 
     def undistorted(self) -> "CameraParameters":
-        """The same camera with a distortion-free lens."""
+        """Return the same camera with a lens without distortion."""
         return replace(self, distortion="none", coefficients=())
 
     def resized(self, width: int, height: int) -> "CameraParameters":
-        """The camera of the images scaled to `width` x `height` px; the aspect ratio may differ."""
+        """Return the camera of images scaled to `width` x `height` px, of any aspect ratio."""
         if self.matrix is None and width * self.height == height * self.width:
             return replace(self, width=width, height=height)
         x, y = width / self.width, height / self.height
@@ -178,7 +179,7 @@ class CameraParameters:
         return replace(self, width=width, height=height, matrix=matrix)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields by name as they are written to files; `stored` omits some defaults."""
+        """Return the fields by name as they are written to files; `stored` omits some defaults."""
         return asdict(self, dict_factory=stored)
 
     def __str__(self) -> str:
@@ -196,13 +197,13 @@ class CameraParameters:
 
 _NAMES = tuple(field.name for field in fields(CameraParameters))
 _LATER = {field.name: field.default for field in fields(CameraParameters)[7:]}
-"""Fields that older files lack, with their defaults."""
+"""Fields that older files do not contain, with their defaults."""
 
 
 def stored(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A `dict_factory` for `dataclasses.asdict`: omits the fields of `_LATER` that have their
-    default value, in cameras at any depth. So the hash of a camera that older files can describe
-    does not change."""
+    """Build a dict for `dataclasses.asdict`: it omits the fields of `_LATER` that have their
+    default value, in cameras at any depth. So a camera that older files can describe keeps its
+    hash."""
     values = dict(pairs)
     if tuple(values) == _NAMES:
         return {k: v for k, v in values.items() if k not in _LATER or v != _LATER[k]}
@@ -210,7 +211,7 @@ def stored(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _numbers(what: str, values: Any, counts: tuple[int, ...]) -> tuple[Any, ...]:
-    """`values` as finite floats; raises CameraError if their number is not in `counts`."""
+    """Return `values` as floats. Raises CameraError unless finite and of a number in `counts`."""
     listed = tuple(values) if isinstance(values, list | tuple) else None
     wanted = " or ".join(map(str, counts))
     if listed is None or len(listed) not in counts:

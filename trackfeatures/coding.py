@@ -1,8 +1,8 @@
 """Encodes features in m and rad as the six training targets of the network, and decodes them.
 
 `y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are in the order of `TARGETS`.
-An absent distance is NaN in m; it is coded as the end of its range that is farther from the car. An
-unknown distance is infinite in m and NaN when coded.
+An absent distance is NaN in m; its code is that of the end of its range that is farther from the
+car. An unknown distance is infinite in m; its code is NaN.
 """
 
 import math
@@ -22,7 +22,7 @@ from trackfeatures.definitions import (
 
 OFFSET, SPAN = 0.1, 0.8
 UNKNOWN_M: Final = math.inf
-"""Marks an unlabelled distance; the loss and the metrics ignore it."""
+"""Value of an unlabelled distance; the loss and the metrics ignore it."""
 IN_LANE_WIDTH_LIMIT_M = 5.5
 """Decoding: `ml` and `mr` are present if `mr - ml` is below this limit."""
 ON_MARKING_LIMIT_M = 2.75
@@ -37,7 +37,8 @@ _ML, _MR, _L, _M, _R, _ANGLE = range(len(TARGETS))
 
 
 def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
-    """Coded targets (N, 6) of distances (N, 5) in m, NaN where absent, and angles (N,) in rad.
+    """Return the coded targets (N, 6) of distances (N, 5) in m, NaN where absent, and angles (N,)
+    in rad.
 
     An unknown distance (`UNKNOWN_M`) is coded as NaN.
     """
@@ -49,14 +50,14 @@ def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
 
 
 def decode_values(coded: ArrayLike) -> NDArray[np.float64]:
-    """The values (N, 6) in m and rad of `coded` (N, 6); absent distances are not detected."""
+    """Return the values (N, 6) in m and rad of `coded` (N, 6), without detecting absence."""
     y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
     values: NDArray[np.float64] = _LO + (y - OFFSET) / SPAN * _WIDTH
     return values
 
 
 def decode(coded: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distances (N, 5) in m, NaN where absent, and angles (N,) in rad from `coded` (N, 6)."""
+    """Decode `coded` (N, 6) to distances (N, 5) in m, NaN where absent, and angles (N,) in rad."""
     values = decode_values(coded)
     distances = values[:, :_ANGLE].copy()
     in_lane = values[:, _MR] - values[:, _ML] < IN_LANE_WIDTH_LIMIT_M
@@ -69,21 +70,21 @@ def decode(coded: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def encode_features(features: TrackFeatures) -> NDArray[np.float32]:
-    """Coded targets (6,) of one set of features."""
+    """Return the coded targets (6,) of one set of features."""
     distances = [np.nan if d is None else d for d in features.distances.values()]
     coded: NDArray[np.float32] = encode([distances], [features.angle])[0]
     return coded
 
 
 def decode_features(coded: ArrayLike, heading: RoadClass) -> TrackFeatures:
-    """The features decoded from `coded` (6,), with the class `heading`."""
+    """Return the features decoded from `coded` (6,), with the class of the road `heading`."""
     distances, angle = decode(coded)
     ml, mr, l, m, r = (None if np.isnan(d) else float(d) for d in distances[0])
     return TrackFeatures(ml, mr, l, m, r, float(angle[0]), heading)
 
 
 def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
-    """The coded targets (N, 6) of the left-right mirrored scenes."""
+    """Return the coded targets (N, 6) of the left-right mirrored scenes."""
     y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
     swapped = 1.0 - y[:, [_MR, _ML, _R, _M, _L, _ANGLE]]
     # The range of `m` is not symmetric about 0, and an absent `m` keeps its code at the upper end.
@@ -94,7 +95,7 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
 
 
 def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
-    """The classes (N,) of the left-right mirrored scenes: LEFT and RIGHT are swapped."""
+    """Return the classes (N,) of the left-right mirrored scenes: LEFT and RIGHT are swapped."""
     classes = np.asarray(heading, dtype=np.int64)
     return np.where(classes == UNKNOWN_HEADING, classes, RoadClass.RIGHT - classes)
 

@@ -1,8 +1,8 @@
-"""What a track feature is: names, signs, ranges and limits. SI units, track frame.
+"""Defines the track features: names, signs, ranges and limits. SI units, track frame.
 
-Distances to markings are measured at the centre of gravity, in the road plane: negative for a
-marking on the left of the car, positive for one on its right. Offsets from the centre of a lane or
-of the road are positive when the car is on the left of it. Source: Li et al., "Reinforcement
+Distances to markings are measured at the centre of gravity, in the road plane. They are negative
+for a marking on the left of the car, positive for one on its right. Offsets from the centre of a
+lane or of the road are positive if the car is on the left of it. Source: Li et al., "Reinforcement
 Learning and Deep Learning based Lateral Control for Autonomous Driving", section V, after
 DeepDriving (Chen et al. 2015).
 """
@@ -40,8 +40,8 @@ LOOK_AHEAD_M: Final = 20.0
 
 
 class RoadClass(IntEnum):
-    """The direction in which the road bends: the third task of the paper's network, which calls it
-    the heading. Files, messages and answers keep the name `heading`."""
+    """The direction in which the road ahead bends. It is the third task of the paper's network,
+    which calls it the heading. Files, messages and answers use the name `heading`."""
 
     LEFT = 0
     STRAIGHT = 1
@@ -49,7 +49,7 @@ class RoadClass(IntEnum):
 
 
 UNKNOWN_HEADING: Final = -1
-"""Marks an unlabelled class; the loss and the metrics ignore it."""
+"""Value of an unlabelled class; the loss and the metrics ignore it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ RANGES: Final = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class TrackFeatures:
-    """The track features at one time."""
+    """The track features of one image or one moment."""
 
     ml: float | None
     """Distance to the marking in m, negative left of the car; None if it is absent. The next four
@@ -97,14 +97,16 @@ class TrackFeatures:
 
     @property
     def to_lane_centre(self) -> float | None:
-        """Offset from the centre of the car's lane, or of the nearest lane (m, left positive)."""
+        """Offset from the centre of the car's lane, or of the nearest lane, in m, left positive;
+        None if no lane is visible."""
         return lane_offset(self.ml, self.mr, self.l, self.m, self.r)
 
 
 def lane_offset(
     ml: float | None, mr: float | None, l: float | None, m: float | None, r: float | None
 ) -> float | None:
-    """Offset from the centre of the nearest lane (m, left positive); None if no lane is visible.
+    """Return the offset from the centre of the nearest lane (m, left positive); None if no lane is
+    visible.
 
     The pair `ml`, `mr` has priority. Without this pair, the lane on the car's side of the marking
     `m` is used; outside the road, the only lane next to `m`.

@@ -2,7 +2,8 @@
 
 Distortion is OpenCV's pinhole model (k1, k2, p1, p2, k3 to k6: calib3d's documentation; Brown 1966)
 or OpenCV's fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). Beyond
-the angle at which the distorted radius stops growing, a model folds; no ray is projected there.
+the angle at which the distorted radius stops growing, a model folds; rays beyond it are not
+projected.
 """
 
 from functools import lru_cache
@@ -16,16 +17,17 @@ if TYPE_CHECKING:
     from trackfeatures.camera import CameraParameters
 
 MAX_ANGLE_RAD = pi / 2 - 1e-3
-"""Largest angle between a ray and the optical axis, since directions are scaled to z = 1."""
+"""Largest angle between ray and optical axis; below pi/2, as rays are scaled to z = 1."""
 TABLE = 4096  # number of angles in the table that inverts the radius
-STEPS = 8  # Newton steps at most; three from the table's value give an error below 1e-12
+STEPS = 8  # largest number of Newton steps; three steps give an error below 1e-12
 CONVERGED = 1e-10  # error in units of the focal length
 
 FloatArray = NDArray[np.float64]
 
 
 def mount_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """Rotation (3, 3) from the car's frame to a camera turned by Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the rotation (3, 3) from the car's to the camera's frame, for Rz(yaw) Ry(pitch)
+    Rx(roll)."""
     cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
     ahead = (cy * cp, sy * cp, -sp)
     left = (cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr)
@@ -34,7 +36,7 @@ def mount_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
 
 
 def project(camera: "CameraParameters", points: FloatArray) -> FloatArray:
-    """Pixels (N, 2) of points (N, 3) in the camera's frame; NaN outside the lens model's range."""
+    """Project points (N, 3) in the camera's frame to pixels (N, 2); NaN outside the lens model."""
     ahead = points[:, 2] > 1e-9
     flat = points[:, :2] / np.where(ahead, points[:, 2], np.nan)[:, None]
     if camera.distortion != "none":
@@ -48,7 +50,7 @@ def project(camera: "CameraParameters", points: FloatArray) -> FloatArray:
 
 
 def rays(camera: "CameraParameters", pixels: ArrayLike) -> FloatArray:
-    """Directions (N, 3) of pixels (N, 2), with z = 1; NaN where the lens maps no ray to a pixel."""
+    """Return ray directions (N, 3), z = 1, of pixels (N, 2); NaN where no ray maps to a pixel."""
     k = camera.intrinsics()
     flat = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - k[:2, 2]) / (k[0, 0], k[1, 1])
     if camera.distortion != "none":
@@ -57,7 +59,7 @@ def rays(camera: "CameraParameters", pixels: ArrayLike) -> FloatArray:
 
 
 def _undistort(camera: "CameraParameters", distorted: FloatArray) -> FloatArray:
-    """Undistorted points (N, 2) on the plane z = 1; NaN where the distortion has no inverse."""
+    """Return undistorted points (N, 2) at z = 1; NaN where the distortion has no inverse."""
     kind, coefficients = camera.distortion, camera.coefficients
     angles, radii = _radius_table(kind, coefficients)
     radius = np.hypot(*distorted.T)
@@ -79,7 +81,7 @@ def _undistort(camera: "CameraParameters", distorted: FloatArray) -> FloatArray:
 
 
 def _distort(camera: "CameraParameters", flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distorted points (N, 2) of `flat` (N, 2) on the plane z = 1, and the Jacobian (2, 2, N)."""
+    """Return distorted points (N, 2) of `flat` (N, 2) at z = 1, and the Jacobian (2, 2, N)."""
     x, y = flat.T
     square = x * x + y * y
     p1 = p2 = 0.0
@@ -112,7 +114,7 @@ def _distort(camera: "CameraParameters", flat: FloatArray) -> tuple[FloatArray, 
 def _fisheye_scale(
     square: FloatArray, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Distorted radius divided by r, and its derivative by r^2, for `square` = r^2 (N,)."""
+    """Return the distorted radius / r, and its derivative by r^2, for `square` = r^2 (N,)."""
     r = np.sqrt(square)
     small = r < 1e-4
     safe = np.where(small, 1.0, r)
@@ -130,19 +132,19 @@ def _padded(coefficients: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _rational(k: tuple[float, ...]) -> tuple[list[float], list[float]]:
-    """Numerator and denominator of OpenCV's model as polynomials of r^2, highest power first."""
+    """Return numerator and denominator of OpenCV's model in r^2, highest power first."""
     return [k[4], k[1], k[0], 1.0], [k[7], k[6], k[5], 1.0]
 
 
 def _angle_polynomial(coefficients: tuple[float, ...]) -> list[float]:
-    """The distorted fisheye radius as a polynomial of the angle, highest power first."""
+    """Return the distorted fisheye radius as a polynomial of the angle, highest power first."""
     k1, k2, k3, k4 = coefficients
     return [k4, 0.0, k3, 0.0, k2, 0.0, k1, 0.0, 1.0, 0.0]
 
 
 @lru_cache(maxsize=64)
 def angle_limit(kind: str, coefficients: tuple[float, ...]) -> float:
-    """The angle from the optical axis in rad at which the distorted radius stops growing."""
+    """Return the angle from the optical axis in rad at which the distorted radius stops growing."""
     if kind == "fisheye":
         limits = _positive_roots(np.polyder(_angle_polynomial(coefficients)))
         return min([*limits, MAX_ANGLE_RAD])
@@ -162,7 +164,7 @@ def _positive_roots(polynomial: NDArray[np.floating[Any]]) -> list[float]:
 
 @lru_cache(maxsize=64)
 def _radius_table(kind: str, coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Angles from the axis (TABLE,) in rad up to `angle_limit`, and their distorted radii."""
+    """Return angles from the axis (TABLE,) in rad up to `angle_limit`, and distorted radii."""
     angles = np.linspace(0.0, angle_limit(kind, coefficients), TABLE)
     if kind == "fisheye":
         return angles, np.asarray(np.polyval(_angle_polynomial(coefficients), angles), np.float64)

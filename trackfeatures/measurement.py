@@ -1,4 +1,4 @@
-"""Track features from the true pose of a car, and the lane offset from track features.
+"""Measures track features from the true pose of a car, and the lane offset from track features.
 
 SI units. `to_middle` is the car's lateral distance from the centre line of the road, left positive.
 """
@@ -25,8 +25,8 @@ from trackfeatures.definitions import (
 from trackfeatures.errors import UserError
 
 LineOffsets = Sequence[tuple[float, float]]
-"""For each marking two offsets from its nominal position in m, left positive: of the line that
-bounds the lane to its left, and of the line that bounds the lane to its right."""
+"""For each marking two offsets from its nominal position in m, left positive: that of the line that
+bounds the lane to its left, and that of the line that bounds the lane to its right."""
 LEFT_LANE, RIGHT_LANE = range(2)
 _ONE_LINE: LineOffsets = ((0.0, 0.0),) * (max(LANES) + 1)
 
@@ -36,7 +36,7 @@ class CentreLine(Protocol):
     curvatures in 1/m (left positive)."""
 
     def project(self, x: float, y: float) -> tuple[float, float]:
-        """Arc length `s` and lateral distance `to_middle` of a point, both in m."""
+        """Return arc length `s` and lateral distance `to_middle` of a point, both in m."""
 
     def heading(self, s: float) -> float: ...
 
@@ -44,7 +44,7 @@ class CentreLine(Protocol):
 
 
 def check_lanes(lanes: int, lane_width_m: float) -> None:
-    """Raise UserError unless the definitions cover this number of lanes and lane width."""
+    """Raises UserError unless the definitions cover this number of lanes and this lane width."""
     if lanes not in LANES:
         raise UserError(f"a road of {lanes} lanes is not supported; give 1, 2 or 3")
     lo, hi = LANE_WIDTH_LIMITS_M
@@ -53,23 +53,23 @@ def check_lanes(lanes: int, lane_width_m: float) -> None:
 
 
 def marking_offsets(lanes: int, lane_width_m: float) -> NDArray[np.float64]:
-    """Lateral positions (lanes + 1,) of the markings in m, from the leftmost to the rightmost."""
+    """Return the lateral positions (lanes + 1,) of the markings in m, leftmost first."""
     return lane_width_m * (lanes / 2 - np.arange(lanes + 1, dtype=np.float64))
 
 
 def lane_index(to_middle: float, lanes: int, lane_width_m: float) -> int:
-    """Index of the lane that the car is in, or that is nearest to it; 0 is the leftmost lane."""
+    """Return the index of the lane that the car is in or nearest to; 0 is the leftmost lane."""
     lane = math.floor(lanes / 2 - to_middle / lane_width_m)
     return min(max(lane, 0), lanes - 1)
 
 
 def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
-    """Lateral position of the centre of lane `index` (m, left positive)."""
+    """Return the lateral position of the centre of lane `index` (m, left positive)."""
     return lane_width_m * (lanes / 2 - index - 0.5)
 
 
 def classify_heading(curvature: float, curvature_ahead: float) -> RoadClass:
-    """The class of a road with `curvature` at the car and `curvature_ahead` 20 m ahead (1/m)."""
+    """Return the class of a road with this `curvature` at the car and `curvature_ahead` (1/m)."""
     for kappa in (curvature, curvature_ahead):
         if abs(kappa) >= BEND_CURVATURE:
             return RoadClass.LEFT if kappa > 0 else RoadClass.RIGHT
@@ -77,7 +77,7 @@ def classify_heading(curvature: float, curvature_ahead: float) -> RoadClass:
 
 
 def wrap_angle(angle: float) -> float:
-    """The equivalent angle in [-pi, pi) (rad)."""
+    """Return the equivalent angle in [-pi, pi) (rad)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -90,10 +90,11 @@ def measure(
     lane_width_m: float,
     line_offsets: LineOffsets = (),
 ) -> TrackFeatures:
-    """The features of a car `to_middle` m left of the centre line, at `angle` (rad) to the road.
+    """Return the features of a car `to_middle` m left of the centre line, at `angle` (rad) to the
+    road.
 
-    `line_offsets` (see `LineOffsets`) is needed for double lines, where each adjacent lane is
-    bounded by its nearer line. Without it every line is at its marking's nominal position.
+    `line_offsets` (see `LineOffsets`) is needed for double lines, where the nearer line bounds each
+    adjacent lane. Without it every line is at the nominal position of its marking.
     """
     offsets = line_offsets or _ONE_LINE
     ml, mr = in_lane_distances(to_middle, lanes, lane_width_m, offsets)
@@ -105,7 +106,7 @@ def measure(
 def measure_pose(
     centre_line: CentreLine, x: float, y: float, yaw: float, lanes: int, lane_width_m: float
 ) -> TrackFeatures:
-    """The features of a car at (x, y) in m with `yaw` in rad (counter-clockwise positive)."""
+    """Return the features of a car at (x, y) in m with `yaw` in rad (counter-clockwise)."""
     check_lanes(lanes, lane_width_m)
     s, to_middle = centre_line.project(x, y)
     angle = wrap_angle(centre_line.heading(s) - yaw)
@@ -116,7 +117,7 @@ def measure_pose(
 def in_lane_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float, float] | tuple[None, None]:
-    """`ml` and `mr` (m), or (None, None) if the in-lane system is inactive. The simulator
+    """Return `ml` and `mr` (m), or (None, None) if the in-lane system is inactive. The simulator
     compiles this function and `on_marking_distances`."""
     lane = lane_index(to_middle, lanes, lane_width_m)
     beside = to_middle - lane_centre(lane, lanes, lane_width_m)
@@ -129,7 +130,7 @@ def in_lane_distances(
 def on_marking_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float | None, float | None, float | None]:
-    """`l`, `m` and `r` (m); None for an absent one."""
+    """Return `l`, `m` and `r` (m); None for an absent one."""
     # Markings are numbered from 0 (leftmost) to `lanes` (rightmost).
     nearest = min(max(round(lanes / 2 - to_middle / lane_width_m), 0), lanes)
     place = to_middle - lane_width_m * (lanes / 2 - nearest)
@@ -144,7 +145,7 @@ def on_marking_distances(
 
 
 def localise(distances: ArrayLike) -> NDArray[np.float64]:
-    """`lane_offset` (N,) in m from distances (N, 5) in m, NaN where absent; NaN without a lane."""
+    """Return `lane_offset` (N,) in m of distances (N, 5) in m (NaN: absent); NaN without a lane."""
     rows = np.atleast_2d(np.asarray(distances, dtype=np.float64)).tolist()
     present = ((None if math.isnan(d) else d for d in row) for row in rows)
     offsets = (lane_offset(*row) for row in present)

@@ -14,16 +14,16 @@ OTHER = re.compile(r"[^A-Za-z0-9._-]")
 
 
 class BadName(UserError, ValueError):
-    """A name with forbidden characters or of forbidden length."""
+    """Raised for a name with forbidden characters or of forbidden length."""
 
 
 def is_name(value: object) -> bool:
-    """Whether `value` is text of letters, digits, `.`, `_` and `-` (ASCII), not `.` or `..`."""
+    """Return whether `value` is text of ASCII letters, digits, `.`, `_`, `-`, not `.` or `..`."""
     return isinstance(value, str) and NAME.fullmatch(value) is not None and value not in (".", "..")
 
 
 def require_name(value: object, what: str) -> str:
-    """Return `value` if it is a name, else raise BadName. `what` is for the message: "round id"."""
+    """Return `value` if it is a name, else raise BadName. `what` names it in the message."""
     if not is_name(value):
         raise BadName(
             f"the {what} is {str(value)[:80]!r}; expected a name of letters, digits, '.', '_' and "
@@ -33,6 +33,6 @@ def require_name(value: object, what: str) -> str:
 
 
 def to_name(text: str) -> str:
-    """`text` with `-` in place of every forbidden character, cut to `MAX_LENGTH`."""
+    """Return `text` with `-` in place of every forbidden character, cut to `MAX_LENGTH`."""
     found = OTHER.sub("-", text)[:MAX_LENGTH]
     return found if is_name(found) else "unnamed"

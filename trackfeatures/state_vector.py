@@ -1,4 +1,4 @@
-"""The paper's state vector (7,): the input of its controllers, which describes car and road."""
+"""The paper's state vector (7,) of car and road, the input of its controllers."""
 
 import math
 
@@ -14,8 +14,8 @@ SPEED_SCALE_M_S = 75.0 / 3.6
 def state_vector(
     offset: float, angle: float, vx: float, vy: float, heading: RoadClass, half_width: float
 ) -> NDArray[np.float64]:
-    """Offset over half the track's width, angle over pi, vx and vy over 75 km/h, and the class of
-    the road one-hot (left, straight, right).
+    """Return (7,): offset / half of the track's width, angle / pi, vx and vy / 75 km/h, and the
+    class of the road one-hot (left, straight, right).
 
     `offset` and `half_width` are in m, `angle` in rad, `vx` and `vy` in m/s.
     """

@@ -1,1 +1,1 @@
-"""Traffic cars: intelligent driver model, lane changes, wrecks."""
+"""Traffic cars: intelligent driver model, lane changes, and cars that were hit."""

@@ -1,7 +1,7 @@
 """Compiled functions on the table of all traffic cars: leaders, lane changes, speeds, positions.
 
-Track frame: s along the centre line, y to the left, m and m/s. A car in a lane change occupies both
-lanes: cars in either lane follow it.
+Track frame: s along the centre line, y to the left, m and m/s. During a lane change a car occupies
+both lanes, and cars in both lanes follow it.
 """
 
 import math
@@ -14,10 +14,10 @@ from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, idm_acc
 # Columns of a car's row.
 S, Y, SPEED, DESIRED, Y_FROM, Y_TO, CHANGE_PROGRESS, CHANGE_LENGTH_M, COOLDOWN_S, STRUCK = range(10)
 CAR_COLUMNS = 10
-# CHANGE_PROGRESS goes from 0 to 1 over a lane change of CHANGE_LENGTH_M; COOLDOWN_S: time until
-# the next one may start. A car with STRUCK = 1 was hit: physics moves it, here it is an obstacle.
-# Columns of a body's row: the extent and speed of a car as others see it; the last row is the ego
-# car.
+# CHANGE_PROGRESS rises from 0 to 1 during a lane change of CHANGE_LENGTH_M. COOLDOWN_S is the time
+# until the next may start. A car with STRUCK = 1 was hit: it is an obstacle that physics moves.
+# Columns of a body's row: extent and speed of a car, for the decisions of other cars; the last row
+# is the ego car.
 B_S, B_RIGHT, B_LEFT, B_SPEED, B_HALF_LENGTH, B_DESIRED = range(6)
 BODY_COLUMNS = 6
 
@@ -25,15 +25,15 @@ SIDE_MARGIN_M = 0.3  # cars with a smaller lateral gap than this are in one corr
 CHANGE_TIME_S = 4.0
 MIN_CHANGE_LENGTH_M = 25.0
 CHANGE_COOLDOWN_S = 3.0
-SAFE_BRAKING = COMFORTABLE_BRAKING  # m/s2: the most a lane change may require of any car
-MIN_GAIN = 0.2  # m/s2: the gain in acceleration above which a car changes lanes
+SAFE_BRAKING = COMFORTABLE_BRAKING  # m/s2: largest braking that a lane change may cause
+MIN_GAIN = 0.2  # m/s2: least gain in acceleration for a lane change
 MIN_LENGTH_RATIO = 0.05  # lane length over centre-line length, near the centre of a bend
 POLITENESS = 0.2  # MOBIL: weight of the new follower's loss
 
 
 @compiled
 def signed_distance(from_s: float, to_s: float, length: float) -> float:
-    """Distance (m) of `to_s` ahead of `from_s` on a loop, in [-length/2, length/2)."""
+    """Return the distance (m) of `to_s` ahead of `from_s` on a loop, in [-length/2, length/2)."""
     return (to_s - from_s + 0.5 * length) % length - 0.5 * length
 
 
@@ -48,10 +48,12 @@ def nearest_body(
     length: float,
     ahead: bool,
 ) -> tuple[int, float]:
-    """The nearest body in the corridor [right, left], ahead or behind: (row, bumper gap in m).
+    """Return the nearest body in the corridor [right, left], ahead or behind: (row, bumper gap in
+    m).
 
-    (-1, inf) if there is none. The gap is negative when the two overlap lengthwise. Of two bodies
-    at the same s, the one with the higher row is ahead, so that each pair has one follower.
+    It is (-1, inf) if there is none. The gap is negative if the two overlap lengthwise. Of two
+    bodies at the same s, the one with the higher row is ahead, so that one of the two follows the
+    other.
     """
     found, smallest = -1, math.inf
     for other in range(bodies.shape[0]):
@@ -83,7 +85,7 @@ def following_acceleration(
     half_length: float,
     length: float,
 ) -> float:
-    """Acceleration (m/s2) of a car at `s` in the corridor [right, left]."""
+    """Return the IDM acceleration (m/s2) of a car at `s` in the corridor [right, left]."""
     lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     lead_speed = bodies[lead, B_SPEED] if lead >= 0 else speed
     return idm_acceleration(gap, speed, lead_speed, desired)
@@ -100,13 +102,14 @@ def lane_change_safe(
     half_length: float,
     length: float,
 ) -> tuple[bool, float]:
-    """Whether a car may change into the corridor: (both gaps are safe, follower's loss in m/s2)."""
+    """Return whether a car may change into the corridor: (both gaps are safe, loss of acceleration
+    of the new follower in m/s2)."""
     lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     if lead >= 0:
         lead_speed = bodies[lead, B_SPEED]
         if gap < STANDSTILL_GAP_M + 0.5 * speed:
             return False, 0.0
-        # At an unlimited desired speed, so that only the leader's effect is judged.
+        # The desired speed is unlimited here, so that only the leader has an effect.
         if idm_acceleration(gap, speed, lead_speed, 1e3) < -SAFE_BRAKING:
             return False, 0.0
     behind, gap = nearest_body(bodies, me, s, right, left, half_length, length, False)
@@ -134,7 +137,7 @@ def lane_change_safe(
 def update_bodies(
     cars: FloatArray, bodies: FloatArray, half_length: float, half_width: float
 ) -> None:
-    """Update the first rows of `bodies` (n + 1, BODY_COLUMNS) from `cars`; skips struck cars."""
+    """Update the rows of all traffic cars in `bodies` (n + 1, BODY_COLUMNS), except struck cars."""
     for i in range(cars.shape[0]):
         if cars[i, STRUCK] > 0.0:
             continue
@@ -184,10 +187,10 @@ def decide_lane_change(
 
 @compiled
 def centre_line_advance(table: FloatArray, s: float, y: float, distance: float) -> float:
-    """Increase of s while a car drives `distance` m at the lateral offset `y`.
+    """Return the increase of s (m) while a car drives `distance` m at the lateral offset `y`.
 
-    A lane on the inside of a bend is shorter than the centre line. Exact across the joints of
-    pieces, where the curvature jumps.
+    A lane on the inside of a bend is shorter than the centre line. The result is exact across the
+    joints of pieces, where the curvature jumps.
     """
     gained, index = 0.0, piece_table.index_at(table, s)
     at = piece_table.wrap(table, s)
@@ -205,8 +208,8 @@ def centre_line_advance(table: FloatArray, s: float, y: float, distance: float) 
 
 @compiled
 def move_car(cars: FloatArray, i: int, advance_m: float, dt: float, length: float) -> None:
-    """Advance car `i` along its lane. The lateral motion of a lane change depends on the distance
-    driven, so a car at rest does not move sideways."""
+    """Advance car `i` along its lane by `advance_m`. The lateral motion of a lane change depends on
+    the distance driven, so a car at rest does not move sideways."""
     cars[i, S] = (cars[i, S] + advance_m) % length
     if cars[i, CHANGE_PROGRESS] >= 1.0:
         cars[i, COOLDOWN_S] = max(cars[i, COOLDOWN_S] - dt, 0.0)
@@ -229,10 +232,11 @@ def step_traffic(
     half_length: float,
     half_width: float,
 ) -> None:
-    """One step of `dt` s; `speed_limit` (cells,) in m/s, in equal cells around the loop.
+    """Advance all cars by one step of `dt` s; `speed_limit` (cells,) is in m/s, in equal cells
+    along s.
 
-    Lane changes are decided car by car, each based on the decisions before it; all accelerations
-    are computed from the state before the step.
+    Lane changes are decided one car after the other, based on the earlier decisions. All
+    accelerations are computed from the state before the step.
     """
     count = cars.shape[0]
     if lane_y.shape[0] > 1:
@@ -254,7 +258,7 @@ def step_traffic(
         wish = following_acceleration(
             bodies, i, cars[i, S], speed, desired, right, left, half_length, length
         )
-        # The limits decrease no faster than comfortable braking, so clamping to them is feasible.
+        # The limits decrease at most at comfortable braking, so the car can keep to them.
         cars[i, SPEED] = min(max(speed + wish * dt, 0.0), limit)
         distance = 0.5 * (speed + cars[i, SPEED]) * dt
         move_car(cars, i, centre_line_advance(table, cars[i, S], cars[i, Y], distance), dt, length)
@@ -263,10 +267,10 @@ def step_traffic(
 
 @compiled
 def update_poses(cars: FloatArray, table: FloatArray, poses: FloatArray) -> None:
-    """Fill `poses` (n, 6): x, y, z, roll, pitch, yaw of the ground point under each car.
+    """Fill `poses` (n, 6): x, y, z, roll, pitch, yaw of the ground point under each car (m, rad).
 
-    Angles as in PyBullet (R = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down); the car's up
-    axis is the road normal. Poses of struck cars are not changed.
+    The angles are PyBullet's (R = Rz(yaw) Ry(pitch) Rx(roll), pitch positive nose down); the car's
+    up axis is the road normal. Poses of struck cars are not changed.
     """
     for i in range(cars.shape[0]):
         if cars[i, STRUCK] > 0.0:
@@ -292,9 +296,9 @@ def update_poses(cars: FloatArray, table: FloatArray, poses: FloatArray) -> None
 
 @compiled
 def limit_deceleration(squared: FloatArray, gain: float) -> None:
-    """Lower the squared speed limits (n,) of cells around a loop, in place, so that they fall by at
-    most `gain` from one cell to the next; `gain` is the decrease by braking within a cell."""
+    """Lower the squared speed limits (n,) of cells along a loop, in place, so that from each cell
+    to the next they decrease by at most `gain` (m2/s2), the decrease by braking within a cell."""
     cells = squared.shape[0]
-    for cell in range(2 * cells - 1, -1, -1):  # two laps: the limits wrap around at the line
+    for cell in range(2 * cells - 1, -1, -1):  # two laps, because the cells form a loop
         ahead = squared[(cell + 1) % cells] + gain
         squared[cell % cells] = min(squared[cell % cells], ahead)

@@ -1,7 +1,8 @@
 """The intelligent driver model (IDM): acceleration from speed, desired speed and gap. SI units.
 
-Treiber, Hennecke, Helbing, "Congested traffic states in empirical observations and microscopic
-simulations", Physical Review E 62 (2000). Traffic and the scripted driver of `datagen` use it.
+Source: Treiber, Hennecke, Helbing, "Congested traffic states in empirical observations and
+microscopic simulations", Physical Review E 62 (2000). Traffic and the scripted driver of `datagen`
+use it.
 """
 
 import math
@@ -19,10 +20,10 @@ _MIN_DESIRED_SPEED = 0.1  # m/s; the model divides by the desired speed
 
 @compiled
 def idm_acceleration(gap: float, speed: float, lead_speed: float, desired_speed: float) -> float:
-    """Acceleration (m/s2) of a driver `gap` m (bumper to bumper) behind a leader.
+    """Return the acceleration (m/s2) of a driver `gap` m (bumper to bumper) behind a leader.
 
-    `gap` is math.inf on a free road. Speeds in m/s. Unlike the original, a driver above the desired
-    speed brakes no harder than comfortable; only a leader can cause harder braking.
+    `gap` is math.inf if there is no leader. Speeds in m/s. Unlike in the original, braking to the
+    desired speed is limited to comfortable braking; only a leader can cause harder braking.
     """
     free = 1.0 - (speed / max(desired_speed, _MIN_DESIRED_SPEED)) ** 4
     free = max(COMFORTABLE_ACCELERATION * free, -COMFORTABLE_BRAKING)

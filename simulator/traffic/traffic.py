@@ -1,8 +1,8 @@
 """Traffic: up to twelve cars in lanes that follow the intelligent driver model.
 
-Cars drive at 40 to 62 km/h, slow down for bends, and change lanes where both gaps are safe and they
-gain by it. The ego car is a leader or follower like any other car. Track frame: s along the centre
-line, to_middle left positive, m and m/s.
+Cars drive at 40 to 62 km/h, slow down for bends, and change lanes if both gaps are safe and they
+gain acceleration. For them the ego car is a leader or follower like any other car. Track frame: s
+along the centre line, to_middle left positive, m and m/s.
 """
 
 import math
@@ -20,7 +20,7 @@ from simulator.vehicle.car import CarParameters
 from trackfeatures.errors import UserError
 
 TRAFFIC_CAR_SIZE = (TRAFFIC_CAR.length, TRAFFIC_CAR.width, TRAFFIC_CAR.height)
-"""Length, width, height of a traffic car (m)."""
+"""Length, width and height of a traffic car (m)."""
 EGO_CAR_SIZE = (CarParameters.length, CarParameters.width, CarParameters.height)
 MAX_CARS = 12
 DESIRED_KMH = (40.0, 62.0)
@@ -31,16 +31,16 @@ START_RANGE_M = 600.0
 LATERAL_ACCELERATION = 3.0
 """Largest lateral acceleration (m/s2) of a car in a bend."""
 
-_PER_CAR_M = 50.0  # least share of the start range per car; more cars widen the range
+_PER_CAR_M = 50.0  # least length of the start range per car
 _MIN_SPACING_M = TRAFFIC_CAR_SIZE[0] + 12.0
 _CELL_M = 1.0
 
 
 class Traffic:
-    """`count` cars on `road`. `rng` draws their start; from then on they are deterministic.
+    """`count` cars on `road`. Their start is random from `rng`; their driving is deterministic.
 
-    `ego_s` is the start of the ego car (m, default: 25 m before the line). Raises UserError when
-    the road has no room for `count` cars.
+    `ego_s` is the start of the ego car (m, default: 25 m before the line). Raises UserError if the
+    road has no room for `count` cars.
     """
 
     def __init__(
@@ -64,30 +64,30 @@ class Traffic:
 
     @property
     def s(self) -> FloatArray:
-        """(n,) m along the centre line, of the car's centre."""
+        """Position (n,) of the cars' centres along the centre line, m."""
         return self._cars[:, car_table.S].copy()
 
     @property
     def to_middle(self) -> FloatArray:
-        """(n,) m, left positive."""
+        """Lateral offset (n,) of the cars from the centre line, m, left positive."""
         return self._cars[:, car_table.Y].copy()
 
     @property
     def speed(self) -> FloatArray:
-        """(n,) m/s along the lane."""
+        """Speed (n,) of the cars along their lanes, m/s."""
         return self._cars[:, car_table.SPEED].copy()
 
     @property
     def desired_speed(self) -> FloatArray:
-        """(n,) m/s each car would drive on a free, straight road."""
+        """Speed (n,) that each car would drive on a free, straight road, m/s."""
         return self._cars[:, car_table.DESIRED].copy()
 
     def poses(self) -> FloatArray:
-        """(n, 6) x, y, z, roll, pitch, yaw (m, rad) of the ground point under each car's centre."""
+        """Return x, y, z, roll, pitch, yaw (n, 6) (m, rad) of the ground points under the cars."""
         return self._poses.copy()
 
     def step(self, dt: float, ego_s: float, ego_to_middle: float, ego_speed: float) -> None:
-        """Advance all cars by `dt` s; the ego car is a leader or follower like any other."""
+        """Advance all cars by `dt` s; ego_s and ego_to_middle in m, ego_speed in m/s."""
         if self.count == 0:
             return
         self._update_ego(ego_s, ego_to_middle, ego_speed)
@@ -106,16 +106,16 @@ class Traffic:
 
     @property
     def struck(self) -> NDArray[np.bool_]:
-        """(n,) whether each car was hit; struck cars are obstacles that physics moves."""
+        """Whether each car was hit (n,). Struck cars are obstacles that physics moves."""
         return self._cars[:, car_table.STRUCK] > 0.0
 
     def mark_struck(self, row: int) -> None:
-        """Remove car `row` from lane driving; from now on `set_struck_pose` moves it."""
+        """Remove car `row` from lane driving; from then on `set_struck_pose` moves it."""
         self._cars[row, car_table.STRUCK] = 1.0
         self._cars[row, car_table.CHANGE_PROGRESS] = 1.0
 
     def set_struck_pose(self, row: int, pose: FloatArray, track_state: FloatArray) -> None:
-        """Set the ground `pose` (6,) of a struck car; `track_state` (4,): s, to_middle, angle and
+        """Set the ground `pose` (6,) of a struck car; `track_state` (4,) is s, to_middle, angle and
         speed along the track. Other cars avoid its bounding box in the track frame."""
         s, to_middle, angle, speed = track_state
         cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
@@ -128,7 +128,8 @@ class Traffic:
         self._bodies[row] = (s, right, left, forward, half_length, max(forward, 1.0))
 
     def leader(self, s: float, to_middle: float) -> tuple[float, float] | None:
-        """Nearest car ahead in the path of a car of the ego's size: (bumper gap m, speed m/s)."""
+        """Return bumper gap (m) and speed (m/s) of the nearest car ahead in the path of a car of
+        the ego car's size at (`s`, `to_middle`), or None."""
         half = 0.5 * EGO_CAR_SIZE[1]
         row, gap = car_table.nearest_body(
             self._bodies[: self.count],
@@ -143,7 +144,7 @@ class Traffic:
         return None if row < 0 else (float(gap), float(self._bodies[row, car_table.B_SPEED]))
 
     def has_room(self, s: float, to_middle: float, speed: float) -> bool:
-        """Whether the ego car at `s` may change to `to_middle` with both gaps safe."""
+        """Return whether both gaps are safe if the ego car at `s` changes to `to_middle`."""
         half = 0.5 * EGO_CAR_SIZE[1]
         safe, _ = car_table.lane_change_safe(
             self._bodies,
@@ -159,7 +160,7 @@ class Traffic:
 
     def _update_ego(self, s: float, to_middle: float, speed: float) -> None:
         half = 0.5 * EGO_CAR_SIZE[1]
-        # The desired speed of the ego car is unknown; its present speed is taken instead.
+        # The desired speed of the ego car is unknown; its current speed is used instead.
         self._bodies[self.count] = (
             s % self._length,
             to_middle - half,
@@ -200,13 +201,13 @@ class Traffic:
             cars[rows, car_table.SPEED] = self._initial_speed(cars[rows], gaps)
         cars[:, car_table.Y_FROM] = cars[:, car_table.Y_TO] = cars[:, car_table.Y]
         cars[:, car_table.CHANGE_PROGRESS] = 1.0
-        # Different cooldowns, so that the first lane changes are not simultaneous.
+        # The cooldowns differ, so that the first lane changes are not simultaneous.
         cars[:, car_table.COOLDOWN_S] = rng.uniform(0.0, car_table.CHANGE_COOLDOWN_S, size=count)
         return cars
 
     def _initial_speed(self, cars: FloatArray, gaps: FloatArray) -> FloatArray:
-        """(n,) start speed (m/s) that keeps the curve limit and the time headway, and from which a
-        car can stop behind a leader at rest; `gaps` (n,) m."""
+        """Return start speeds (n,) in m/s that keep the speed limit and the time headway, and from
+        which each car can stop behind a leader at rest; `gaps` (n,) m."""
         cells = len(self._limit)
         cell = (cars[:, car_table.S] / self._length * cells).astype(int) % cells
         free = np.maximum(gaps - STANDSTILL_GAP_M, 0.0)
@@ -216,15 +217,15 @@ class Traffic:
 
 
 def _random_places(count: int, reach: float, rng: np.random.Generator) -> FloatArray:
-    """(count,) ascending random positions in [0, reach], one in each of `count` equal parts."""
+    """Return ascending random positions (count,) in [0, reach], one in each of `count` parts."""
     part = reach / max(count, 1)
     return part * np.arange(count) + rng.uniform(0.0, max(part - _MIN_SPACING_M, 0.0), count)
 
 
 def _curve_speed_limits(track: Track, outermost_y: float) -> FloatArray:
-    """(cells,) speed limits (m/s) in cells of about 1 m around the loop.
+    """Return speed limits (cells,) in m/s, in cells of about 1 m around the loop.
 
-    The limit is that of the innermost lane and falls before a bend at comfortable braking.
+    The limit is that of the innermost lane; before a bend it decreases at comfortable braking.
     """
     cells = math.ceil(track.length_m / _CELL_M)
     step = track.length_m / cells

@@ -1,4 +1,4 @@
-"""A traffic car that was hit: a rigid body with wheels and its brakes applied, until it is at rest.
+"""A traffic car that was hit: a rigid body with wheels and applied brakes, until it is at rest.
 
 Other traffic treats it as an obstacle and stops behind it. World frame, SI units.
 """
@@ -57,7 +57,7 @@ _CONTROLS = np.array([0.0, 0.0, BRAKE, 0.0])
 
 @dataclass
 class Wreck:
-    """One struck car; `moving` until it has come to rest."""
+    """One struck car, `moving` until it is at rest; `motion` and `memory` as in `dynamics`."""
 
     row: int
     """Index of the car in the traffic."""
@@ -69,7 +69,8 @@ class Wreck:
     def from_traffic(
         cls, row: int, motion: FloatArray, s: float, speed: float, table: Table
     ) -> "Wreck":
-        """Traffic car `row`, which drove `speed` m/s at `s`, with the motion after the impact."""
+        """Make a wreck of traffic car `row`, which drove `speed` m/s at `s` m; `motion` (13,) is
+        its motion after the impact."""
         memory = np.zeros(MEMORY)
         memory[PIECE] = index_at(table, s)
         memory[SPIN : SPIN + 4] = speed / TRAFFIC_CAR.wheel_radius
@@ -77,20 +78,20 @@ class Wreck:
         return cls(row, motion, memory)
 
     def forces(self, params: NDArray[Any], table: Table, ground: Ground) -> FloatArray:
-        """(force, torque) (6,) of road, air and gravity over the next physics step."""
+        """Return force and torque (6,) of road, air and gravity for the next physics step."""
         wrench = np.empty(6)
         compute_forces(params, table, ground, self.motion, self.memory, _CONTROLS, wrench)
         return wrench
 
     def update_rest(self) -> None:
-        """Update `moving`; a car that has come to rest gets zero velocity."""
+        """Update `moving`; set the velocity of a car that has come to rest to zero."""
         slow = np.linalg.norm(self.motion[7:10]) < AT_REST_M_S
         self.moving = not (slow and np.linalg.norm(self.motion[10:13]) < AT_REST_RAD_S)
         if not self.moving:
             self.motion[7:13] = 0.0
 
     def pose_for_traffic(self, table: Table) -> tuple[FloatArray, FloatArray]:
-        """(ground pose (6,); s, to_middle, angle and speed along the track (4,))."""
+        """Return the ground pose (6,), and s, to_middle, angle and speed along the track (4,)."""
         readings = np.empty(TRACK_STATE_SIZE)
         measure_track_state(table, self.motion, self.memory, readings)
         up = rotation(self.motion[3:7])[2]
@@ -104,8 +105,8 @@ class Wreck:
 def lane_motion(
     pose: FloatArray, move: FloatArray, share: float, dt: float, motion: FloatArray
 ) -> None:
-    """Fill `motion` (13,) of a traffic car in its lane: its ground `pose` (6,) at the start of a
-    control step of `dt` s plus the fraction `share` of its change `move` (6,) over the step."""
+    """Fill `motion` (13,) of a traffic car in its lane. `pose` (6,) is its ground pose at the start
+    of a control step of `dt` s, `move` (6,) its change over the step, `share` the fraction done."""
     roll = 0.5 * (pose[3] + share * move[3])
     pitch = 0.5 * (pose[4] + share * move[4])
     yaw = 0.5 * (pose[5] + share * move[5])

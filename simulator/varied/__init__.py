@@ -1,4 +1,4 @@
-"""Varied roads: the random values of each round and scene of `--roads varied`; see ranges.toml."""
+"""Random values of the rounds and scenes of `--roads varied`; ranges.toml contains their ranges."""
 
 ROADS = ("paper", "varied")
-"""Kinds of roads: "paper" has lanes of 4.0 m and the tracks' own paint, "varied" random values."""
+"""Kinds of roads: "paper" has lanes of 4.0 m and the tracks' own paint; "varied" is random."""

@@ -1,8 +1,8 @@
 """Lanes, shoulders, camera height and lines of one round. Metres; the leftmost line comes first.
 
 Neighbouring markings are one lane width apart, equal for all lanes. The two lines of a double line
-between lanes lie on both sides of the marking's nominal position; at an edge, the inner line lies
-at that position.
+between lanes lie on both sides of the marking's nominal position. At an edge of the road, the inner
+of the two lines lies at that position.
 """
 
 import math
@@ -15,15 +15,15 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.definitions import LANE_WIDTH_LIMITS_M
 
 APPARENT_WIDTH_M = (2.75, 4.4)
-"""Least and greatest apparent width of a lane in the model's pictures: a camera at another height
-shows the road enlarged by the ratio of the heights."""
+"""Least and greatest apparent width of a lane in the model's pictures. A camera at another height
+shows the road scaled by the ratio of the heights."""
 MODEL_HEIGHT_M = CameraParameters().height_above_road_m
 CAMERA_HEIGHT_M = (0.9, 2.2)
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of paint, or a row of dots; its middle is `offset_m` left of the nominal position of
+    """One line of paint, or a row of dots. Its middle is `offset_m` left of the nominal position of
     its marking."""
 
     offset_m: float
@@ -32,9 +32,9 @@ class Line:
     dash_m: float = 0.0
     """Length of a dash."""
     gap_m: float = 0.0
-    """Gap between two dashes; 0: the line is solid, or consists of dots only."""
+    """Gap between two dashes; 0: the line is solid, or consists only of dots."""
     dots_m: float = 0.0
-    """Distance between Botts' dots, where there is no paint; 0: no dots."""
+    """Distance between Botts' dots, which lie where there is no paint; 0: no dots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Marking:
 @dataclass(frozen=True, slots=True)
 class Carriageway:
     """The random values of one round's road: lanes, shoulders, camera height and markings. The
-    track is chosen separately."""
+    track is selected separately."""
 
     lane_width_m: float
     shoulders_m: tuple[float, float]
@@ -69,7 +69,8 @@ class Carriageway:
 
     @staticmethod
     def drawn(seed: int, lanes: int, model_height_m: float = MODEL_HEIGHT_M) -> "Carriageway":
-        """The road of the round with `seed`; `model_height_m`: height of the model's camera."""
+        """Return the random road of the round with `seed`; `model_height_m` is the height of the
+        model's camera above the road."""
         size = draw(ranges(), "lanes", generator(seed, "lanes"))
         place = draw(ranges(), "camera", generator(seed, "camera"))["place"]
         width = round(float(size["width_m"]), 3)
@@ -89,7 +90,7 @@ class Carriageway:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Carriageway":
-        """The carriageway with these values; KeyError, TypeError or ValueError for other values."""
+        """Return the carriageway with `values`. Raises KeyError, TypeError or ValueError if bad."""
         found: Carriageway = rebuilt(Carriageway, values)
         return found
 
@@ -97,9 +98,11 @@ class Carriageway:
 def camera_heights(
     lane_width_m: float, narrowest_m: float = math.inf, model_height_m: float = MODEL_HEIGHT_M
 ) -> tuple[float, float]:
-    """The least and the greatest camera height (m) that keep a lane within APPARENT_WIDTH_M.
+    """Return the least and greatest camera height (m) with which lanes appear within
+    APPARENT_WIDTH_M.
 
-    `narrowest_m`: width of the narrowest lane, since a double line takes some of the width.
+    `narrowest_m` is the width of the narrowest lane, since a double line occupies some of the
+    width.
     """
     apparent_low, apparent_high = APPARENT_WIDTH_M
     low, high = CAMERA_HEIGHT_M
@@ -109,8 +112,8 @@ def camera_heights(
 
 
 def _markings(drawn: dict[str, Any], lanes: int, lane_width_m: float) -> tuple[Marking, ...]:
-    """The markings of a road, from the values of section [lines]."""
-    # A lane beside double lines must not become narrower than the definitions allow.
+    """Return the markings of a road from random values of the section [lines]."""
+    # A lane beside a double line must not be narrower than the definitions allow.
     room = lane_width_m - LANE_WIDTH_LIMITS_M[0]
     left = _marking(drawn, "left", drawn["edge_width_m"], drawn["edge_dash_m"], 0.5)
     right = _marking(drawn, "right", drawn["edge_width_m"], drawn["edge_dash_m"], -0.5)
@@ -126,10 +129,10 @@ def _marking(
     inner: float,
     room_m: float = math.inf,
 ) -> Marking:
-    """The marking `name` of one of the kinds in ranges.toml.
+    """Return the marking `name` ("left", "right" or "divider"), of one of the kinds in ranges.toml.
 
-    `inner` shifts a double line to the left by that share of the distance between its lines. If the
-    lines lie more than `room_m` apart, only the first one is kept.
+    `inner` shifts a double line to the left by this share of the distance between its lines. If the
+    lines are more than `room_m` apart, only the first line is used.
     """
     kind, colour = str(drawn[name]), str(drawn[f"{name}_colour"])
     apart = width_m + float(drawn["apart_m"])

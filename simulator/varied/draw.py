@@ -1,6 +1,7 @@
-"""Draws values from the tables of a TOML file of ranges; `ranges.toml` explains the notation.
+"""Draws random values from a TOML file of ranges; `ranges.toml` explains the notation.
 
-A section's values are drawn in the order of the file, so the same generator gives the same values.
+The values of a section are drawn in the order of the file, so the same generator gives the same
+values.
 """
 
 import tomllib
@@ -17,33 +18,33 @@ Values = dict[str, Any]
 Kind = TypeVar("Kind")
 
 SECTIONS = ("lanes", "camera", "lines", "paint", "surface", "roadside", "light", "lens", "cabin")
-"""Sections of ranges.toml. A section's index here seeds its generator: append, do not reorder."""
+"""Sections of ranges.toml. The index seeds a section's generator: append, do not reorder."""
 STREAM = 20
-"""Part of the seed of generators of varied roads; smaller numbers draw scenery and drives."""
+"""Part of the seed of the generators of varied roads; scenery and drives use smaller numbers."""
 
 
 def generator(seed: int, section: str, scene: int = 0) -> np.random.Generator:
-    """The generator of one section for scene number `scene` of the round with `seed`."""
+    """Return the generator of one section, for scene number `scene` of the round with `seed`."""
     return np.random.default_rng([seed, STREAM + SECTIONS.index(section), scene])
 
 
 @cache
 def ranges() -> Tables:
-    """The sections of ranges.toml."""
+    """Return the sections of ranges.toml."""
     text = files("simulator.varied").joinpath("ranges.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 
 def drawn_as(kind: type[Kind], section: str, rng: np.random.Generator) -> Kind:
-    """An object of the dataclass `kind`, whose fields are random values of the section
+    """Return an object of the dataclass `kind`; its fields are random values of the section
     `section`."""
     values = draw(ranges(), section, rng)
     return kind(**{f.name: values[f.name] for f in fields(kind) if f.name in values})  # type: ignore[arg-type]
 
 
 def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
-    """Random values of the table `name`. If the table has the entry `like`, the values of the table
-    that `like` names come first; the table's own entries replace them."""
+    """Return random values of the table `name`. If it has the entry `like`, the values of the table
+    that `like` names are drawn first; entries of the table itself replace them."""
     table = tables[name]
     drawn: Values = draw(tables, table["like"], rng) if "like" in table else {}
     for entry, value in table.items():
@@ -81,9 +82,10 @@ def _value(value: Any, drawn: Values, scale: float, rng: np.random.Generator) ->
 
 
 def rebuilt(kind: Any, value: Any) -> Any:
-    """The object of type `kind` whose `dataclasses.asdict`, through JSON or not, is `value`.
+    """Return the object of type `kind` whose `dataclasses.asdict` is `value`; also after JSON,
+    which turns tuples into lists.
 
-    Raises KeyError, TypeError or ValueError for the values of another type.
+    Raises KeyError, TypeError or ValueError for values of another type.
     """
     if is_dataclass(kind):
         hints = get_type_hints(kind)

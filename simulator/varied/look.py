@@ -1,6 +1,6 @@
-"""The random values of one scene of `--roads varied`; a scene of `--roads paper` has no look.
+"""The random values of one scene of `--roads varied`; scenes of `--roads paper` have no look.
 
-The defaults of every part leave the picture as the track's scenery has it.
+The default values of all parts leave the picture as the track's scenery defines it.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -13,7 +13,7 @@ ArrowKind = Literal["ahead", "left", "right"]
 
 @dataclass(frozen=True, slots=True)
 class Paint:
-    """The paint of one scene; ranges.toml, section [paint], explains the values."""
+    """The paint of one scene; the section [paint] of ranges.toml explains the values."""
 
     tone: float = 1.0
     wear: float = 0.0
@@ -36,22 +36,22 @@ class Surface:
     warmth: float = 0.0
     """Excess of red over blue in the asphalt's colour, as a share."""
     other_tone: float = 0.0
-    """Albedo of a second material, whose sections alternate with the first; 0: no such material."""
+    """Albedo of a second material, whose sections alternate with the first's; 0: none."""
     section_m: float = 100.0
-    """Mean length of a section of either material, m."""
+    """Mean length of the sections of both materials, m."""
     concrete: float = 0.0
-    """Sections made of concrete slabs: 0 none, 1 the sections of both materials, -1 of the second
-    only."""
+    """Sections made of concrete slabs: 0 none, 1 those of both materials, -1 those of the
+    second."""
     joint_m: float = 5.0
     """Distance between the joints of concrete slabs."""
     halves: float = 0.0
-    """Difference in tone of the two sides of a lengthwise seam, as a share."""
+    """Difference in tone between the two sides of a lengthwise seam, as a share."""
     seam_m: float = 0.0
-    """Lateral position of that seam, left of the road's centre."""
+    """Lateral position of that seam, m left of the road's centre."""
     tar: float = 0.0
-    """How many of the seams and cracks are filled with tar, 0 to 1."""
+    """Share of the seams and cracks that are filled with tar, 0 to 1."""
     patches: float = 0.0
-    """Share of the surface in patches of another tone."""
+    """Share of the surface that is covered with patches of another tone."""
     patch_tone: float = 0.7
     tracks: float = 0.14
     """Share by which wheels have darkened the surface; negative: brightened."""
@@ -59,11 +59,11 @@ class Surface:
     puddles: float = 0.0
     """Share of the surface under water."""
     ragged_m: float = 0.0
-    """How far the asphalt's edge deviates from a straight line."""
+    """Largest deviation of the asphalt's edge from a straight line."""
     gravel_m: float = 0.0
     """Width of a strip of gravel beside the asphalt."""
     kerb_m: float = 0.0
-    """Width of kerb stones beside the asphalt; 0: none."""
+    """Width of kerb stones beside the asphalt; 0: no kerb stones."""
     phase: float = 0.0
 
 
@@ -72,49 +72,49 @@ class Roadside:
     """Objects close to the road in one scene; see ranges.toml, section [roadside]."""
 
     gap_m: float = -1.0
-    """Least distance from the asphalt to the barriers; negative: they stand where cars hit them."""
+    """Least distance from asphalt to barriers; negative: they are drawn where cars hit them."""
     left: str = ""
-    """Kind of the barrier on the left of the road (see `camera.scene.barriers`); "": by sections,
-    as the track's scenery has it."""
+    """Kind of the barrier on the left of the road (see `camera.scene.barriers`). "": the kinds
+    change by section, as in the track's scenery."""
     right: str = ""
     height: float = 1.0
     """Factor on the height of walls, crops and snow banks."""
     trees: float = 1.0
     """Factor on the number of trees."""
     tunnel: bool = False
-    """Trees stand in dense rows behind the barriers, and their crowns close over the road."""
+    """Whether dense rows of trees stand behind the barriers, their crowns closed over the road."""
     parked_every_m: float = 0.0
     """Mean distance between cars parked beside the asphalt; 0: no cars."""
     bridge_every_m: float = 0.0
-    """Distance between bridges over the road; 0: the distance of the track's scenery."""
+    """Distance between bridges over the road; 0: the distance in the track's scenery."""
     dry: float = 0.0
-    """Share of the grass that is yellow, in addition to the scenery's share."""
+    """Share of the grass that is yellow, in addition to that of the scenery."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """Light and exposure of one scene, beyond its kind; see ranges.toml, section [light]."""
+    """Light and exposure of one scene; see ranges.toml, section [light]."""
 
     exposure_stops: float = 0.0
     """Stops by which the picture is overexposed."""
     adaptation_stops: float = 0.0
-    """Stops by which the exposure has opened at the end of a bridge's shadow."""
+    """Stops by which the exposure has increased at the end of a bridge's shadow."""
     low_sun_deg: float = 0.0
     """Elevation of a low sun; 0: the elevation of the kind of light."""
     flare: float = 0.0
     """Strength of the sun's glare in the lens."""
     night: bool = False
     lamp_every_m: float = 0.0
-    """Distance between lit street lamps by night; 0: no lamps."""
+    """Distance between lit street lamps at night; 0: no lamps."""
     lamp_warmth: float = 0.5
-    """Colour of lamps, 0 white to 1 sodium."""
+    """Colour of the lamps, from 0 (white) to 1 (sodium)."""
     headlights: float = 1.0
-    """Brightness of the car's headlights by night."""
+    """Brightness of the car's headlights at night, as a factor."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Effects of lens and sensor on the pictures of one scene; see ranges.toml, [lens]."""
+    """Effects of lens and sensor on the pictures of one scene; see ranges.toml, section [lens]."""
 
     vignette: float = 0.0
     """Share of the light lost in the corners."""
@@ -126,7 +126,7 @@ class Lens:
     noise: float = 0.0
     """Standard deviation of the noise in display values of 0 to 255, before the tone curve."""
     contrast: float = 0.0
-    """Contrast of the tone curve, beyond the contrast that displays expect."""
+    """Additional slope in the middle of the tone curve; 0: a linear curve."""
     red_gain: float = 1.0
     blue_gain: float = 1.0
     jpeg_quality: int = 0
@@ -138,11 +138,11 @@ class Cabin:
     """Parts of the car that the camera sees in one scene; see ranges.toml, section [cabin]."""
 
     bonnet: float = 0.0
-    """Share of the picture's rows that the bonnet's highest point covers; 0: out of sight."""
+    """Share of the picture's rows that the bonnet's highest point covers; 0: not visible."""
     reflection: float = 0.0
-    """Share of a bright dashboard's light that the windscreen mirrors."""
+    """Share of a bright dashboard's light that the windscreen reflects."""
     dirt: float = 0.0
-    """Dirt on the windscreen, 0 to 1."""
+    """Amount of dirt on the windscreen, 0 to 1."""
     drops: float = 0.0
     """Share of the windscreen that rain drops cover just before a stroke of the wiper."""
     wipers: bool = False
@@ -152,7 +152,7 @@ class Cabin:
 
 @dataclass(frozen=True, slots=True)
 class RoadLook:
-    """The look of one scene. The defaults of every part leave the picture unchanged."""
+    """The look of one scene. The default values of all parts leave the picture unchanged."""
 
     paint: Paint = field(default_factory=Paint)
     surface: Surface = field(default_factory=Surface)
@@ -163,7 +163,7 @@ class RoadLook:
 
     @staticmethod
     def drawn(seed: int, scene: int = 0) -> "RoadLook":
-        """The look of scene number `scene` of the round with `seed`."""
+        """Return the random look of scene number `scene` of the round with `seed`."""
         return RoadLook(
             paint=drawn_as(Paint, "paint", generator(seed, "paint", scene)),
             surface=drawn_as(Surface, "surface", generator(seed, "surface", scene)),
@@ -174,11 +174,11 @@ class RoadLook:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """The values by name, as they are written to files."""
+        """Return the values by name, as they are written to files."""
         return asdict(self)
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "RoadLook":
-        """The look with these values; raises KeyError, TypeError or ValueError for other values."""
+        """Return the look with these values. Raises KeyError, TypeError or ValueError if bad."""
         look: RoadLook = rebuilt(RoadLook, values)
         return look

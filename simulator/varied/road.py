@@ -1,4 +1,4 @@
-"""Makes the road that a command or an environment asks for by the name of its kind."""
+"""Makes a road of the kind ("paper" or "varied") that a command or an environment names."""
 
 import trackfeatures as tf
 from simulator.track.geometry import Track
@@ -11,10 +11,10 @@ from trackfeatures.errors import UserError
 def make_road(
     track: Track, lanes: int, lane_width_m: float | None, roads: str = ROADS[0], seed: int = 0
 ) -> Road:
-    """A road of one of `ROADS`. A varied road, its lane width included, is random with the seed
-    `seed`.
+    """Make a road of one of `ROADS`. A varied road, including its lane width, is random with the
+    seed `seed`.
 
-    Raises UserError for an unknown kind, or a lane width for a varied road.
+    Raises UserError for an unknown kind, or for a lane width given for a varied road.
     """
     if roads not in ROADS:
         raise UserError(f"unknown roads {roads!r}; choose {', '.join(ROADS)}")

@@ -10,19 +10,19 @@ from simulator.varied.look import RoadLook
 
 @dataclass(frozen=True, slots=True)
 class VariedRound:
-    """One round's road, and the look of each of its scenes, in order."""
+    """The road of one round, and the looks of its scenes in order."""
 
     carriageway: Carriageway
     scenes: tuple[RoadLook, ...]
 
     @staticmethod
     def drawn(seed: int, lanes: int, scenes: int, model_height_m: float) -> "VariedRound":
-        """The round with `seed`, for a model whose camera is `model_height_m` above the road."""
+        """Return the round with `seed`; the model's camera is `model_height_m` above the road."""
         looks = tuple(RoadLook.drawn(seed, scene) for scene in range(scenes))
         return VariedRound(Carriageway.drawn(seed, lanes, model_height_m), looks)
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "VariedRound":
-        """The round with these values; KeyError, TypeError or ValueError for other values."""
+        """Return the round with these values. Raises KeyError, TypeError or ValueError if bad."""
         found: VariedRound = rebuilt(VariedRound, values)
         return found

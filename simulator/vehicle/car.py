@@ -1,10 +1,10 @@
 """The parameters of a car (SI units; body frame x forward, y left, z up).
 
 The defaults describe TORCS's car1-trb1, the car of the paper's experiments. The mass and the axle
-distances (lf, lr) are also the paper's. Two values differ from the paper: its yaw inertia
-(2000 kg m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
-(`controllers.laws.lateral_model`). The recorded TORCS laps of this car show 1120 kg m2 and
-125 kN/rad; with the paper's values it deviates twice as far in the kink of g-track-3.
+distances (lf, lr) are also the paper's. Two values differ from the paper. Its yaw inertia (2000 kg
+m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
+(`controllers.laws.lateral_model`). The recorded TORCS laps of this car show 1120 kg m2 and 125
+kN/rad; with the paper's values the simulated car deviates twice as far in the kink of g-track-3.
 """
 
 import math
@@ -28,16 +28,16 @@ LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
 class CarParameters:
     """The parameters of one car; the defaults are TORCS's car1-trb1 (see the module's docstring).
 
-    Raises UserError for a value that is not positive, or a torque table of another length.
+    Raises UserError for a value that is not positive, or a torque table of the wrong length.
     """
 
     mass: float = 1150.0
     """kg, without fuel."""
     fuel: float = 80.0
-    """kg; at the centre of gravity; constant."""
+    """kg; constant, at the centre of gravity."""
     inertia: tuple[float, float, float] = (477.0, 868.0, 1113.0)
-    """kg m2 about x (roll), y (pitch) and z (yaw): a box of the car's size, with TORCS's mass
-    repartition coefficient of 0.62 on its length."""
+    """kg m2 about x (roll), y (pitch) and z (yaw): those of a box of the car's size, with TORCS's
+    mass repartition coefficient of 0.62 on its length."""
     front_axle: float = 1.27
     """m from the centre of gravity to the front axle, lf."""
     rear_axle: float = 1.37
@@ -62,36 +62,37 @@ class CarParameters:
     bump_travel: float = 0.08
     """m of compression beyond rest at which the bump stop acts."""
     bump_spring: float = 600_000.0
-    """N/m added beyond the bump stop."""
+    """N/m of the bump stop, added to that of the spring."""
 
     wheel_radius: float = 0.3273
     wheel_inertia: float = 1.2
-    """kg m2, one wheel."""
+    """kg m2 of one wheel."""
     friction: float = 1.6
-    """Friction coefficient (largest tyre force over load) at `working_load`, on grip 1."""
+    """Friction coefficient (largest tyre force / load) at `working_load`, on grip 1."""
     tyre_stiffness: float = 20.0
-    """1/rad: slope of the tyre force at zero slip over its largest value (Pacejka's B C)."""
+    """1/rad: slope of the tyre force at zero slip, divided by the largest force (Pacejka's B C)."""
     tyre_shape: float = 1.41
     """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
     tyre_curvature: float = 0.7
     """E of the magic formula."""
     camber_gain_front: float = 1.048
-    """Factor of the wheels' camber on the friction: 1 + 0.05 sin(18 camber), camber 4 deg."""
+    """Factor of the front wheels' camber (4 deg) on the friction: 1 + 0.05 sin(18 camber)."""
     camber_gain_rear: float = 1.040
-    """Factor of the rear wheels' camber, 3 deg, on the friction."""
+    """Factor of the rear wheels' camber (3 deg) on the friction."""
     working_load: float = 1.2
-    """Load at which the friction is nominal, over the static load without fuel."""
+    """Ratio of the load with nominal friction to the static load without fuel."""
     friction_unloaded: float = 1.6
-    """Friction at zero load over the nominal one; it falls exponentially with the load."""
+    """Ratio of friction at zero load to nominal friction; friction falls exponentially with
+    load."""
     friction_overloaded: float = 0.8
-    """Friction at infinite load over the nominal one."""
+    """Ratio of friction at infinite load to nominal friction."""
     rolling_resistance: float = 0.001
-    """Rolling resistance force over load, on asphalt."""
+    """Ratio of rolling resistance force to load, on asphalt."""
 
     steering_lock: float = 0.36652
-    """rad of the front wheels at steer = 1 (21 deg)."""
+    """Angle of the front wheels at steer = 1, rad (21 deg)."""
     steering_rate: float = 6.2832
-    """rad/s of the front wheels (360 deg/s)."""
+    """Largest angular speed of the front wheels' steering, rad/s (360 deg/s)."""
 
     air_density: float = 1.23
     drag_coefficient: float = 0.35
@@ -99,7 +100,7 @@ class CarParameters:
     wing_drag: float = 0.47
     """m2: drag coefficient times area of the wings."""
     lift_front: float = 1.79
-    """m2: downforce coefficient times area, at the front axle; wing and ground effect."""
+    """m2: downforce coefficient times area at the front axle, of wing and ground effect."""
     lift_rear: float = 2.96
 
     gears: tuple[float, float, float, float, float, float] = (3.0, 1.9, 1.4, 1.1, 0.9, 0.77)
@@ -107,23 +108,23 @@ class CarParameters:
     final_drive: float = 4.5
     driveline_efficiency: float = 0.984
     engine_inertia: float = 0.02
-    """kg m2, at the crankshaft; fitted: in gear 1 the effective mass is 6.3 % larger in TORCS."""
+    """kg m2 at the crankshaft; fitted: in gear 1 the effective mass is 6.3 % larger in TORCS."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
-    """Above this speed the engine gives no torque in gear, neither drive nor braking."""
+    """Above this engine speed the engine gives no torque in gear, neither drive nor braking."""
     top_rpm: float = 10_000.0
-    """End of the torque table; in gear the engine is held at this speed."""
+    """End of the torque table; in gear the engine never exceeds this speed."""
     torque: tuple[float, ...] = (
         100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
     )  # fmt: skip
     """N m at full throttle at 0, 1000, ... 10000 rev/min."""
     engine_braking: float = 0.33
-    """Braking torque at closed throttle over full-load torque, at `top_rpm`; 0 at idle."""
+    """Ratio of braking torque at closed throttle to full-load torque, at `top_rpm`; 0 at idle."""
     differential_viscosity: float = 30.0
-    """N m s/rad between the rear wheels."""
+    """N m s/rad of speed difference between the rear wheels."""
 
     brake_torque: float = 9_000.0
-    """N m at full brake, sum of the four wheels; enough to lock them."""
+    """N m at full brake, sum of the four wheels; it is enough to lock them."""
     brake_front_share: float = 0.58
 
     def __post_init__(self) -> None:
@@ -154,7 +155,7 @@ class CarParameters:
         )
 
     def cornering_stiffness(self, front: bool, grip: float) -> float:
-        """Cornering stiffness (N/rad) of one tyre at its static load, on ground of this grip."""
+        """Return the cornering stiffness (N/rad) of one tyre at static load, with this `grip`."""
         load = self.static_loads[0 if front else 1]
         share = load / (self.working_load * load * self.mass / self.total_mass)
         spread = self.friction_unloaded - self.friction_overloaded
@@ -164,7 +165,7 @@ class CarParameters:
         return float(self.tyre_stiffness * self.friction * nominal * gain * grip * load)
 
     def packed(self) -> NDArray[Any]:
-        """The parameters and numbers derived from them: an array (1,) for compiled code."""
+        """Return the parameters and values derived from them as an array (1,) for compiled code."""
         values = [getattr(self, field.name) for field in fields(self)]
         layout = [
             (field.name, "f8", (len(value),) if isinstance(value, tuple) else ())

@@ -1,4 +1,4 @@
-"""Forces of the wheels, the air and gravity on the car's body, in one compiled step of 1/200 s.
+"""Forces of wheels, air and gravity on the car's body, in one compiled step of 1/200 s.
 
 World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units.
 This module computes force and torque; `rigid_body` or PyBullet moves the body.
@@ -35,24 +35,24 @@ from simulator.world.control_rate import PHYSICS_HZ
 
 DT = 1.0 / PHYSICS_HZ
 
-# Internal state of the car beside its body's motion, `memory` (MEMORY,): front-wheel angle (rad),
+# Internal state of the car besides its body's motion, `memory` (MEMORY,): front-wheel angle (rad),
 # engine speed (rad/s), four wheel speeds (rad/s), track piece of the last lookup, odometer (m).
 STEER, ENGINE, SPIN, PIECE, ODOMETER, MEMORY = 0, 1, 2, 6, 7, 8
 # A motion (MOTION,): position, quaternion (x, y, z, w), velocity, angular velocity; world frame.
 MOTION = 13
 UNDERBODY_CLEARANCE_M = 0.10
-"""Height of the centre of gravity over the road (m) at which the underbody touches it."""
+"""Height of the centre of gravity over the road (m) at which the underbody touches the road."""
 UNDERBODY_SPRING, UNDERBODY_DAMPER = 500_000.0, 20_000.0
 
 
 Work = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """Memory for one physics step, reused in the next: axes (3, 3), wheels (4, WHEEL), slip gains (4,),
-velocity (6,), turned wheels (9,), wrench (6,)."""
+velocity (6,), `turn_wheels`'s array (9,), wrench (6,)."""
 
 
 @compiled
 def make_work() -> Work:
-    """Memory for the physics steps of one car."""
+    """Allocate the memory for the physics steps of one car."""
     work = (
         np.empty((3, 3)),
         np.empty((4, WHEEL)),
@@ -67,13 +67,13 @@ def make_work() -> Work:
 
 @compiled
 def forget_turn(work: Work) -> None:
-    """Let the next step compute the wheels' turn, because it may be another car's."""
+    """Make the next step compute the wheels' angles anew, because it may be another car's."""
     work[4][0] = math.nan
 
 
 @inlined
 def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
-    """Front-wheel angle (rad) after `dt` s of turning towards `command` in [-1, 1]."""
+    """Return the front-wheel angle (rad) after `dt` s of steering towards `command` in [-1, 1]."""
     step = p.steering_rate * dt
     wanted = command * p.steering_lock
     return float(angle + min(max(wanted - angle, -step), step))
@@ -81,8 +81,8 @@ def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
 
 @inlined
 def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
-    """Wheel speed (rad/s) after a brake torque `brake` (N m) has acted on `spin` for `dt` s; it
-    stops the wheel but never reverses it."""
+    """Return the wheel speed (rad/s) after a brake torque `brake` (N m) has acted on `spin` for
+    `dt` s. The brake stops the wheel but never reverses it."""
     lost = brake * dt / inertia
     if spin > lost:
         return spin - lost
@@ -118,7 +118,7 @@ def update_wheel_speeds(
         _, shaft_torque, shaft_inertia = clutch(p, shaft, command[1])
         torque = 0.5 * shaft_torque * ratio * p.driveline_efficiency
         inertia = 0.5 * shaft_inertia * ratio * ratio
-    # An open differential gives both rear wheels the same torque, and the engine's inertia acts on
+    # An open differential gives both rear wheels equal torque, and the engine's inertia acts on
     # their mean speed. The viscous coupling reduces the difference of their speeds.
     mean_gain = 0.5 * (slip_gain[2] + slip_gain[3])
     moment_left = slip_gain[2] * (along[2] - r * spin[2])
@@ -140,7 +140,7 @@ def update_wheel_speeds(
 
 @inlined
 def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: FloatArray) -> None:
-    """Add drag along the body and downforce at both axles (quadratic in the forward speed)."""
+    """Add drag and both axles' downforce, quadratic in forward speed, to `wrench` (6,)."""
     speed = axes[0, 0] * velocity[0] + axes[0, 1] * velocity[1] + axes[0, 2] * velocity[2]
     pressure = 0.5 * p.air_density * speed * speed
     drag = pressure * (p.drag_coefficient * p.frontal_area + p.wing_drag)
@@ -158,8 +158,8 @@ def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: Flo
 def add_underbody_contact(
     depth: float, normal: tuple[float, float, float], velocity: FloatArray, wrench: FloatArray
 ) -> None:
-    """Add the contact force of an underbody `depth` m below the road: it supports a car that lies
-    on its underbody, side or roof, where the wheels do not."""
+    """Add the contact force of an underbody `depth` m below the road. It supports a car that lies
+    on its underbody, side or roof, where the wheels give no support."""
     if depth > 0.0:
         nx, ny, nz = normal
         closing = -(velocity[0] * nx + velocity[1] * ny + velocity[2] * nz)
@@ -173,7 +173,7 @@ def add_underbody_contact(
 def accelerate(
     p: Any, axes: FloatArray, wrench: FloatArray, dt: float, velocity: FloatArray
 ) -> None:
-    """Add the change of `velocity` (6,), linear and angular, under `wrench` (6,) over `dt` s."""
+    """Add to `velocity` (6,), linear and angular, its change under `wrench` (6,) over `dt` s."""
     for i in range(3):
         velocity[i] += dt * wrench[i] / p.total_mass
     for i in range(3):
@@ -193,12 +193,12 @@ def compute_forces(
     command: FloatArray,
     wrench: FloatArray,
 ) -> None:
-    """One 200 Hz step: updates `memory` and fills `wrench` (6,), the (force, torque) on the body
-    at its centre of gravity in the world frame, gravity included.
+    """Compute the forces of one 200 Hz step. Updates `memory` and fills `wrench` (6,), the (force,
+    torque) on the body at its centre of gravity in the world frame, including gravity.
 
-    Forces are evaluated at the velocity half a step ahead (midpoint rule): tyres are stiff for
-    200 Hz, and with the present velocity yaw would settle as if the car had 15 % less inertia.
-    params: `CarParameters.packed()`; command: steer, throttle, brake in their ranges, and gear.
+    The forces are those at the velocity half a step ahead (midpoint rule). Tyres are stiff for 200
+    Hz: with the current velocity, yaw would settle as if the car had 15 % less inertia. params:
+    `CarParameters.packed()`; command: steer, throttle, brake in their ranges, and gear.
     """
     work = make_work()
     fill_axes(motion[3:7], work[0])
@@ -219,8 +219,8 @@ def compute_forces_at(
     command: FloatArray,
     work: Work,
 ) -> None:
-    """`compute_forces` of a car whose position `at` (see `locate`) and axes in `work` are already
-    computed; the wrench is written to `work`."""
+    """Compute the same as `compute_forces`, for a car whose position `at` (see `locate`) and axes
+    in `work` are already computed; the wrench is written to `work`."""
     axes, wheels, slip_gain, velocity, turned, wrench = work
     spin = memory[SPIN : SPIN + 4]
     piece, s, d = at

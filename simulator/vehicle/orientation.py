@@ -1,4 +1,4 @@
-"""Conversion between the axes of a body in the world frame and a quaternion (x, y, z, w)."""
+"""Converts between the axes of a body in the world frame and a quaternion (x, y, z, w)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,9 @@ from runtime.jit import compiled, inlined
 def quaternion(
     forward: NDArray[np.float64], left: NDArray[np.float64], up: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Unit quaternion (x, y, z, w) of the frame with these orthonormal axes, each (3,).
+    """Return the unit quaternion (x, y, z, w) of the frame with these orthonormal axes, each (3,).
 
-    Uses the one of four equivalent formulas that has the largest divisor (Shepperd, 1978).
+    Of four equivalent formulas, the one with the largest divisor is used (Shepperd, 1978).
     """
     trace = forward[0] + left[1] + up[2]
     w = 1.0 + trace
@@ -32,8 +32,8 @@ def quaternion(
 
 @compiled
 def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Body axes (forward, left, up) as the rows of a (3, 3) matrix, from a unit quaternion
-    (x, y, z, w)."""
+    """Return the body axes (forward, left, up) of a unit quaternion (x, y, z, w), as the rows of a
+    (3, 3) matrix."""
     axes = np.empty((3, 3))
     fill_axes(quaternion, axes)
     return axes
@@ -41,7 +41,7 @@ def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @inlined
 def fill_axes(quaternion: NDArray[np.float64], axes: NDArray[np.float64]) -> None:
-    """Fill `axes` (3, 3), as `rotation`."""
+    """Fill `axes` (3, 3) with the body axes (forward, left, up) of a unit quaternion, as rows."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     axes[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     axes[0, 1] = 2.0 * (x * y + w * z)

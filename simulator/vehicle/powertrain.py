@@ -8,7 +8,7 @@ from simulator.vehicle.car import RPM, TORQUE_RPM_STEP
 
 @inlined
 def gear_ratio(p: Any, gear: int) -> float:
-    """Engine speed over rear-wheel speed; negative in reverse, 0 in neutral."""
+    """Return the ratio of engine speed to rear-wheel speed: negative in reverse, 0 in neutral."""
     if gear > 0:
         return float(p.gears[gear - 1] * p.final_drive)
     if gear < 0:
@@ -18,10 +18,11 @@ def gear_ratio(p: Any, gear: int) -> float:
 
 @inlined
 def engine_torque(p: Any, speed: float, throttle: float) -> float:
-    """Torque (N m) at the crankshaft at `speed` rad/s.
+    """Return the torque (N m) at the crankshaft at `speed` rad/s and `throttle` (0 to 1).
 
-    As in TORCS: the full-load torque times (throttle (1 + b) - b), where the engine braking b grows
-    linearly from 0 at idle. Matches the accelerations in recorded TORCS drives to 0.003 m/s2.
+    As in TORCS, it is the full-load torque times (throttle (1 + b) - b), where the engine braking b
+    grows linearly from 0 at idle. It gives the accelerations of recorded TORCS drives to 0.003
+    m/s2.
     """
     rpm = speed * RPM
     place = min(max(rpm / TORQUE_RPM_STEP, 0.0), 9.999)
@@ -34,9 +35,10 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
 
 @inlined
 def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
-    """Mean speed (rad/s) of the driven wheels, held where the engine turns at `top_rpm`.
+    """Return the mean speed (rad/s) of the driven wheels, limited to that at the engine speed
+    `top_rpm`.
 
-    As in TORCS, the engine goes no faster in gear: the tyres then slip and slow the car.
+    As in TORCS, the engine turns no faster in gear: the tyres then slip and slow the car.
     """
     top = p.top_rpm / RPM
     return float(top / ratio if wheel_speed * ratio > top else wheel_speed)
@@ -44,14 +46,15 @@ def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
 
 @compiled
 def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float:
-    """Engine speed (rad/s) after `dt` s in neutral."""
+    """Return the engine speed (rad/s) after `dt` s in neutral."""
     faster = speed + dt * engine_torque(p, speed, throttle) / p.engine_inertia
     return float(min(max(faster, p.idle_rpm / RPM), p.top_rpm / RPM))
 
 
 @inlined
 def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, float]:
-    """(engine speed, torque, inertia) at the gearbox input shaft turning at `shaft_speed` rad/s.
+    """Return (engine speed, torque, inertia) at the gearbox input shaft, which turns at
+    `shaft_speed` rad/s (rad/s, N m, kg m2).
 
     Below idle speed the clutch slips: the engine idles and transmits its torque, but its inertia
     does not act on the shaft. Above the limiter the engine gives no torque, neither drive nor

@@ -1,7 +1,7 @@
-"""Rigid-body motion of a free car: one compiled physics step.
+"""Rigid-body motion of a free car, one compiled physics step at a time.
 
-Integrates with PyBullet's scheme (semi-implicit Euler, exact rotation), so that the result is the
-same whether PyBullet or this code moves the body. World frame, SI units.
+The integration scheme is PyBullet's (semi-implicit Euler, exact rotation), so that the result is
+the same whether PyBullet or this code moves the body. World frame, SI units.
 """
 
 import math
@@ -14,8 +14,9 @@ from simulator.vehicle.dynamics import DT, accelerate
 
 @inlined
 def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
-    """Change of the angular velocity (body frame, rad/s) by one step of Euler's equations without
-    torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
+    """Return the change of the angular velocity (body frame, rad/s) in one step of Euler's
+    equations without torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC
+    2015)."""
     wx = axes[0, 0] * motion[10] + axes[0, 1] * motion[11] + axes[0, 2] * motion[12]
     wy = axes[1, 0] * motion[10] + axes[1, 1] * motion[11] + axes[1, 2] * motion[12]
     wz = axes[2, 0] * motion[10] + axes[2, 1] * motion[11] + axes[2, 2] * motion[12]
@@ -35,10 +36,10 @@ def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[flo
 
 @inlined
 def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -> None:
-    """Rotate a unit quaternion (x, y, z, w) by the angular velocity (world frame) over `dt`."""
+    """Rotate a unit quaternion (x, y, z, w), in place, by a world angular velocity over `dt`."""
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     half = 0.5 * rate * dt
-    # sin(half) / rate without cancellation at rest.
+    # `scale` is sin(half) / rate, without cancellation at rest.
     scale = 0.5 * dt - dt**3 * rate * rate / 48.0 if rate < 1e-3 else math.sin(half) / rate
     ax, ay, az, aw = wx * scale, wy * scale, wz * scale, math.cos(half)
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
@@ -55,7 +56,7 @@ def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -
 @inlined
 def integrate(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
     """Move a free body with the `axes` (3, 3) by one physics step under `wrench` (6,), (force,
-    torque)."""
+    torque). Updates `motion` (13,)."""
     tx, ty, tz = gyroscopic_change(p, axes, motion)
     accelerate(p, axes, wrench, DT, motion[7:13])
     for i in range(3):

@@ -12,7 +12,7 @@ class Command:
     """The paper's four actuator commands."""
 
     steer: float = 0.0
-    """[-1, 1], left positive; times the steering lock is the front-wheel angle."""
+    """[-1, 1], left positive; steer times the steering lock is the front-wheel angle."""
     throttle: float = 0.0
     """[0, 1]"""
     brake: float = 0.0
@@ -23,7 +23,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class CarState:
-    """The car at one time; x, y, z is its centre of gravity in the world frame (m)."""
+    """The state of the car at one time; x, y, z is its centre of gravity in the world frame (m)."""
 
     time_s: float
     x: float
@@ -51,18 +51,18 @@ class CarState:
     wheel_spin: tuple[float, float, float, float]
     """rad/s: front left, front right, rear left, rear right."""
     steer: float
-    """Actual front-wheel angle as a fraction of the lock; lags the command."""
+    """Actual front-wheel angle as a fraction of the lock; it lags behind the command."""
     lap: int
     odometer_m: float
     lap_time_s: float
     collision: Collision | None
-    """What the body touched during the last control step, None for nothing."""
+    """What the body touched during the last control step; None if nothing."""
     off_track: bool
     backwards: bool
 
     @property
     def speed(self) -> float:
-        """m/s in the road plane; negative when the car rolls back."""
+        """Speed in the road plane, m/s; negative if the car rolls backwards."""
         return speed_of(self.vx, self.vy)
 
     @property
@@ -71,7 +71,7 @@ class CarState:
 
 
 def speed_of(vx: float, vy: float) -> float:
-    """The speed (m/s) in the road plane; negative when the car rolls back."""
-    # Compiled code and numpy have a hypot with other last bits.
+    """Return the speed (m/s) in the road plane; negative if the car rolls backwards."""
+    # math.hypot, because hypot of compiled code and of numpy differs in the last bits.
     planar = math.hypot(vx, vy)
     return planar if vx >= 0.0 else -planar

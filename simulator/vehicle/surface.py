@@ -8,7 +8,7 @@ from simulator.track.road import Road
 
 @dataclass(frozen=True)
 class SurfaceFriction:
-    """The effect of a surface on the tyre."""
+    """The effect of a surface on the tyre forces."""
 
     grip: float
     """Factor on the tyre's friction coefficient."""
@@ -26,19 +26,19 @@ SURFACES = {
 VERGE = SurfaceFriction(0.8, 5.0)
 
 Ground = tuple[float, float, float, float, float]
-"""Grip and rolling of the road, grip and rolling of the verge, and the distance from the centre at
-which the verge begins (m)."""
+"""Grip and rolling factor of the road, grip and rolling factor of the verge, and the distance (m)
+from the centre at which the verge begins."""
 
 
 def ground(road: Road) -> Ground:
-    """The surface parameters of `road` as a tuple for compiled code."""
+    """Return the surface parameters of `road` as a tuple for compiled code."""
     surface = SURFACES[road.track.surface]
     return (surface.grip, surface.rolling, VERGE.grip, VERGE.rolling, road.half_asphalt)
 
 
 @inlined
 def surface_under_wheel(ground: Ground, to_middle: float) -> tuple[float, float]:
-    """(grip, rolling) at a lateral offset (m) from the track's centre."""
+    """Return grip and rolling factor at a lateral offset (m) from the track's centre."""
     if abs(to_middle) > ground[4]:
         return ground[2], ground[3]
     return ground[0], ground[1]

@@ -1,6 +1,6 @@
 """A body's state relative to the track: position, orientation and speeds. SI units, rad.
 
-This is the only place that computes angle = track tangent - yaw.
+Only this module computes the angle, track tangent minus yaw.
 """
 
 import math
@@ -22,7 +22,7 @@ TRACK_STATE_SIZE = 12
 def measure_track_state(
     table: Table, motion: FloatArray, memory: FloatArray, out: FloatArray
 ) -> None:
-    """Fill `out` (TRACK_STATE_SIZE,) for one car, and update its PIECE in `memory`."""
+    """Fill `out` (TRACK_STATE_SIZE,), the track state of a car; update PIECE in `memory`."""
     piece, s, to_middle = locate(table, motion[0], motion[1], int(memory[PIECE]))
     memory[PIECE] = piece
     curvature = table[piece, CURVATURE]

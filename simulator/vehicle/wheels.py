@@ -13,10 +13,10 @@ from simulator.vehicle.surface import Ground, surface_under_wheel
 from simulator.vehicle.tyre import peak_force, tyre_slip_gain
 
 MAX_TRAVEL_M = 0.25
-"""Largest compression of a suspension strut from rest."""
+"""Largest compression of a suspension strut, measured from rest."""
 MIN_UPRIGHT_COSINE = 0.2
-"""Cosine of the angle between the car's up axis and the road normal below which the car lies on its
-side, without wheel contact."""
+"""If the cosine of the angle between the car's up axis and the road normal is below this value, the
+car lies on its side and its wheels have no contact."""
 
 # One wheel's row of `wheels` (4, WHEEL): arm from the centre of gravity to the contact point, road
 # normal, directions forward and left in the road plane (3 each); spring force (N), damper constant
@@ -28,8 +28,8 @@ SPRING, DAMPER, GRIP, ROLLING, ALONG, ACROSS, LOAD, PEAK, WHEEL = 12, 13, 14, 15
 
 @compiled
 def wheel_angle(p: Any, wheel: int, steer: float) -> float:
-    """Angle (rad) of one wheel under Ackermann steering: the inner front wheel has the commanded
-    angle `steer`, as in TORCS, and both front wheels roll about one centre."""
+    """Return the angle (rad) of one wheel under Ackermann steering. The inner front wheel has the
+    commanded angle `steer`, as in TORCS, and both front wheels roll about one centre."""
     if wheel > 1 or steer == 0.0:
         return 0.0
     inner = (wheel == 0) == (steer > 0.0)
@@ -44,8 +44,8 @@ def wheel_angle(p: Any, wheel: int, steer: float) -> float:
 
 @inlined
 def turn_wheels(p: Any, steer: float, turned: FloatArray) -> None:
-    """Fill `turned` (9,): `steer`, and the cosine and sine of each wheel's angle. Steering mostly
-    rests, so that they are computed once for several steps."""
+    """Fill `turned` (9,): `steer`, and the cosine and sine of each wheel's angle. They are computed
+    only if `steer` has changed, which is seldom."""
     if turned[0] == steer:
         return
     turned[0] = steer
@@ -85,7 +85,7 @@ def locate_contacts(
         )
         reach = (
             (pz - z) * nz / upright_cosine
-        )  # along the strut, from the height of the CG to the road
+        )  # distance along the strut from the height of the CG to the road
         for i in range(3):
             wheels[wheel, ARM + i] = axes[0, i] * x + axes[1, i] * y - axes[2, i] * reach
         wheels[wheel, NORMAL], wheels[wheel, NORMAL + 1] = nx, ny
@@ -108,8 +108,8 @@ def locate_contacts(
 def set_directions(
     wheels: FloatArray, wheel: int, axes: FloatArray, cos_a: float, sin_a: float
 ) -> None:
-    """Fill in a wheel's directions in the road plane, turned to the left of the body's by the angle
-    of this cosine and sine."""
+    """Fill a wheel's directions in the road plane, turned to the left of the body's directions by
+    the angle with the cosine `cos_a` and the sine `sin_a`."""
     nx, ny, nz = wheels[wheel, NORMAL], wheels[wheel, NORMAL + 1], wheels[wheel, NORMAL + 2]
     fx = axes[0, 0] * cos_a + axes[1, 0] * sin_a
     fy = axes[0, 1] * cos_a + axes[1, 1] * sin_a
@@ -127,8 +127,8 @@ def set_directions(
 
 @inlined
 def spring_force(p: Any, front: bool, compression: float, other: float) -> float:
-    """Force (N) of one wheel's spring, anti-roll bar and bump stop, at `compression` m from rest,
-    the other wheel of the axle at `other` m."""
+    """Return the force (N) of a wheel's spring, anti-roll bar and bump stop at `compression` m from
+    rest; `other` (m) is the compression of the axle's other wheel."""
     force = p.load_front if front else p.load_rear
     force += (p.spring_front if front else p.spring_rear) * compression
     force += (p.anti_roll_front if front else p.anti_roll_rear) * (compression - other)
@@ -137,7 +137,7 @@ def spring_force(p: Any, front: bool, compression: float, other: float) -> float
 
 @inlined
 def along(wheels: FloatArray, wheel: int, axis: int, vx: float, vy: float, vz: float) -> float:
-    """Component of a velocity along a direction of a wheel's row."""
+    """Return the component of a velocity along a direction (`axis`) of a wheel's row."""
     x, y, z = wheels[wheel, axis], wheels[wheel, axis + 1], wheels[wheel, axis + 2]
     return float(vx * x + vy * y + vz * z)
 
@@ -145,7 +145,7 @@ def along(wheels: FloatArray, wheel: int, axis: int, vx: float, vy: float, vz: f
 @inlined
 def update_loads(p: Any, velocity: FloatArray, wheels: FloatArray) -> None:
     """Fill the entries of `wheels` that depend on the body's `velocity` (6,), linear and angular:
-    contact point speeds, load, largest tyre force."""
+    speeds of the contact point, load, largest tyre force."""
     for wheel in range(4):
         x, y, z = wheels[wheel, ARM], wheels[wheel, ARM + 1], wheels[wheel, ARM + 2]
         vx = velocity[0] + velocity[4] * z - velocity[5] * y
@@ -198,7 +198,7 @@ def add_tyre_forces(
 def component(
     wheels: FloatArray, wheel: int, axis: int, forward: float, leftward: float, load: float
 ) -> float:
-    """World-frame component `axis` (N) of a force given in the directions of a wheel."""
+    """Return the world-frame component `axis` (N) of a force given in a wheel's directions."""
     ahead = wheels[wheel, FORWARD + axis] * forward
     return float(
         ahead + wheels[wheel, LEFT + axis] * leftward + wheels[wheel, NORMAL + axis] * load
@@ -215,7 +215,7 @@ def add_force(
     arm_y: float,
     arm_z: float,
 ) -> None:
-    """Add a world-frame force at the arm (m) from the centre of gravity to `wrench` (6,)."""
+    """Add a force (N, world frame) with the arm (m) from the centre of gravity to `wrench` (6,)."""
     wrench[0] += fx
     wrench[1] += fy
     wrench[2] += fz

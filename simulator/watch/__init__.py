@@ -2,7 +2,7 @@
 
     simulator watch --track coast --lanes 2 --traffic 6
 
-Or watch a drive of your own, as it trains:
+To watch a drive of your own program, for example in training:
 
     from simulator.watch import Watcher
 
@@ -19,8 +19,7 @@ __all__ = ["Watcher"]
 
 
 def __getattr__(name: str) -> Any:
-    # Imported on request: the command reports bad options before PyBullet, which prints a line of
-    # its own, is loaded.
+    # Imported at first use, so that the command reports bad options before it loads the simulator.
     if name == "Watcher":
         from simulator.watch.watcher import Watcher
 

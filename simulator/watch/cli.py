@@ -1,4 +1,4 @@
-"""The command `simulator watch`: drives and serves until Ctrl-C.
+"""The command `simulator watch`, which drives and serves until Ctrl-C.
 
 simulator watch --track coast --lanes 2 --traffic 6 --light overcast --port 8765
 """

@@ -1,4 +1,4 @@
-"""The drive that `simulator watch` shows: by the built-in driver, or by a browser's keys."""
+"""The drive that `simulator watch` shows, by the built-in driver or by a browser's keys."""
 
 import sys
 import time
@@ -21,13 +21,13 @@ from simulator.world.world import World
 SHOW_S: Final = 1.0 / 26.0
 """Least interval between updates of the browsers (s of wall-clock time)."""
 MAX_IMAGE_AGE_S: Final = 0.25
-"""Images are skipped while the drive is late, but for no longer than this."""
+"""Longest time for which images are skipped while the drive is late."""
 ENDED_S: Final = 2.0
-"""How long the end of an episode is shown before the next begins."""
+"""Time for which the end of an episode is shown before the next one begins."""
 
 
 class Drive:
-    """A drive in `world` without end; requests of browsers come through `hub`.
+    """An endless drive in `world`; the requests of browsers arrive through `hub`.
 
     Raises NoRendererError if there is no renderer.
     """
@@ -50,13 +50,13 @@ class Drive:
         self._ended_at: float | None = None
         self._last_show = self._last_picture = 0.0
         self._taken: set[str] = set()
-        """Views already rendered for the current state."""
+        """Views that are already rendered for the current state."""
         self._scene = scene_message(world.road, controls=True)
         self._warm_up()
         self._start()
 
     def advance(self) -> None:
-        """Do one control step, publish it to the browsers, and wait until the next is due."""
+        """Do one control step, publish it to the browsers, and wait until the next one is due."""
         self._handle_requests()
         if self._ended_at is not None:
             if time.monotonic() - self._ended_at > ENDED_S:
@@ -70,8 +70,8 @@ class Drive:
         self._renderer.close()
 
     def _warm_up(self) -> None:
-        """Compile and build everything before a browser waits for it; takes seconds, more with an
-        empty cache. Does not change the drive."""
+        """Compile and build everything before a browser waits for it. This takes seconds, more with
+        an empty cache, and does not change the drive."""
         self.world.reset(seed=self._seed)
         for command in (
             self._cruise.command(self.world.state, self.world.traffic),
@@ -82,7 +82,7 @@ class Drive:
         self._renderer.render(self.world, [FIRST_VIEW])
 
     def _start(self) -> None:
-        """Start the next episode, with another seed and so other traffic."""
+        """Start the next episode, with another seed and therefore other traffic."""
         road = self.world.road
         lane = tf.lane_centre(road.lanes - 1, road.lanes, road.lane_width)
         self.world.reset(seed=self._seed, to_middle=lane)
@@ -137,7 +137,7 @@ class Drive:
             self._taken.clear()
 
     def _release_controls(self) -> None:
-        """Return control to the built-in driver, in the car's present lane."""
+        """Return control to the built-in driver, which keeps the car's current lane."""
         self.driver, self._holder = "built-in", None
         self._keyboard.release()
         self._cruise.take_over()

@@ -1,11 +1,11 @@
-"""The paper's score of a watched drive, summed up step by step."""
+"""The paper's score of a watched drive, summed step by step."""
 
 from simulator.env.reward import Ending, ending, step_reward
 from simulator.world.world import World
 
 
 class Score:
-    """Sums the reward over an episode; a decrease of the time starts a new episode."""
+    """Sums the reward over an episode. If the time decreases, a new episode has begun."""
 
     def __init__(self) -> None:
         self.episode = 0
@@ -17,8 +17,8 @@ class Score:
         self.ended: Ending | None = None
 
     def count(self, world: World) -> float:
-        """Add the present state of `world` to the score, once per state. Returns the simulated
-        seconds since the state that was added before."""
+        """Add the current state of `world` to the score, once per state. Returns the simulated time
+        (s) since the state added before."""
         now = world.state
         passed = now.time_s - self._time
         if passed < 0.0:
@@ -37,7 +37,7 @@ class Score:
         return passed
 
     def as_dict(self) -> dict[str, float | int | str | None]:
-        """The score's entries of the state message."""
+        """Return the score's entries of the state message."""
         steps = max(self.steps, 1)
         return {
             "episode": self.episode,

@@ -1,7 +1,7 @@
 """Exchange between a drive (one thread) and its browsers (the server's event loop).
 
-The drive never waits: a state or image that a browser has not fetched is replaced by the next.
-Browsers are woken when there is a new state.
+The drive never waits: a new state or image replaces an older one that a browser has not fetched. A
+new state wakes the browsers.
 """
 
 import asyncio
@@ -13,7 +13,7 @@ from simulator.watch.requests import BrowserRequest
 MAX_BROWSERS = 16
 MAX_REQUESTS = 256
 MAX_UNANSWERED = 2
-"""Most unanswered messages per browser; on a slow connection older states are then skipped."""
+"""Largest number of unanswered messages per browser; at it, states are skipped."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class Browser:
     picture: tuple[str, int] = ("", 0)
     """View and number of the last picture sent."""
     pending: int = 0
-    """Messages sent and not yet answered."""
+    """Number of messages sent and not yet answered."""
 
 
 class Hub:
-    """Shared by one drive and one server; every method may be called from either's thread."""
+    """Data shared by one drive and one server; both threads may call every method."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -57,7 +57,7 @@ class Hub:
     # Called by the drive.
 
     def publish(self, number: int, scene: str, state: str, pictures: dict[str, bytes]) -> None:
-        """Publish a state; `pictures` holds the views rendered for it."""
+        """Publish a state; `pictures` are the JPEGs of the views rendered for it."""
         with self._lock:
             before = self.latest
             kept = before.pictures if before is not None and before.scene is scene else {}
@@ -68,17 +68,17 @@ class Hub:
             self._call(loop)
 
     def wanted_views(self) -> tuple[str, ...]:
-        """The views that browsers show, each once."""
+        """Return the views that browsers show, each once."""
         with self._lock:
             return tuple(dict.fromkeys(browser.view for browser in self._browsers))
 
     @property
     def watching(self) -> int:
-        """How many browsers are connected."""
+        """Number of connected browsers."""
         return len(self._browsers)
 
     def take_requests(self) -> tuple[list[tuple[Browser, BrowserRequest]], list[Browser]]:
-        """The requests since the last call, and the browsers that have disconnected."""
+        """Return the requests and the browsers that disconnected since the last call."""
         with self._lock:
             requests, left = self._requests, self._left
             self._requests, self._left = [], []
@@ -87,7 +87,7 @@ class Hub:
     # Called by the server, in its event loop.
 
     def join(self, view: str) -> Browser | None:
-        """Register a new browser; None if there are too many."""
+        """Register a new browser that shows `view`; returns None if there are too many browsers."""
         with self._lock:
             self._loop = asyncio.get_running_loop()
             if len(self._browsers) >= MAX_BROWSERS:
@@ -103,7 +103,7 @@ class Hub:
             self._left.append(browser)
 
     def submit(self, browser: Browser, request: BrowserRequest) -> None:
-        """Queue a browser's request for the drive; beyond MAX_REQUESTS the oldest are dropped."""
+        """Queue a browser's request for the drive; beyond MAX_REQUESTS the oldest is removed."""
         with self._lock:
             self._requests.append((browser, request))
             del self._requests[:-MAX_REQUESTS]

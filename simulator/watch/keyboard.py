@@ -10,8 +10,8 @@ from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 
 HELD_S: Final = 0.7
-"""Time after which keys count as released, unless the browser repeats them."""
-LATERAL_ACCELERATION: Final = 6.0  # m/s2 that a held key asks for
+"""Time after which keys count as released unless the browser repeats them."""
+LATERAL_ACCELERATION: Final = 6.0  # m/s2 in the bend that a held key causes
 MAX_STEER: Final = 0.7
 STEER_RATE: Final = 2.0  # 1/s
 MAX_SPEED: Final = 45.0  # m/s
@@ -43,7 +43,7 @@ class Keyboard:
         self._keys, self._until = keys, self._clock() + HELD_S
 
     def command(self, state: CarState) -> Command:
-        """The command for one control step."""
+        """Return the command for one control step."""
         keys = self._keys if self._clock() < self._until else frozenset()
         wanted = self._reach(state.speed) * (("left" in keys) - ("right" in keys))
         most = STEER_RATE * self._dt
@@ -60,7 +60,7 @@ class Keyboard:
         return Command(self._steer, throttle, brake, gear)
 
     def _reach(self, speed: float) -> float:
-        """Steering of a held key: limited by LATERAL_ACCELERATION, so less at higher speed."""
+        """Return the steering for a held key; LATERAL_ACCELERATION lowers it at high speed."""
         car = self._car
         wheel = LATERAL_ACCELERATION * car.wheelbase / max(speed * speed, 1.0)
         return min(wheel / car.steering_lock, MAX_STEER)

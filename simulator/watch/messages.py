@@ -1,5 +1,5 @@
-"""Messages to a browser: the scene once, the state with every image. JSON, SI units unless the name
-says otherwise; angles counter-clockwise except `angle`, which is track tangent minus yaw."""
+"""JSON messages to a browser: the scene once, the state with every image. SI units unless a name
+states another unit; angles counter-clockwise, except `angle`: track tangent minus yaw."""
 
 import json
 import math
@@ -20,7 +20,7 @@ MAX_STATIONS: Final = 6000
 
 
 def scene_message(road: Road, *, controls: bool) -> str:
-    """The constant data of one road; `controls`: whether a browser may drive and pause."""
+    """Return the constant data of one road; `controls`: whether a browser may drive and pause."""
     track = road.track
     count = min(math.ceil(track.length_m / STATION_M), MAX_STATIONS)
     pose = track.at(np.arange(count) * track.length_m / count)
@@ -47,7 +47,7 @@ def scene_message(road: Road, *, controls: bool) -> str:
 
 
 def state_message(world: World, **about: Any) -> str:
-    """The car and its surroundings; `about` holds the drive's own values (score, rate, ...)."""
+    """Return the car and its surroundings; `about` adds the drive's values (score, rate, ...)."""
     now = world.state
     features = world.features()
     state = {

@@ -1,4 +1,4 @@
-"""JPEG images of a watched world, in any light; the scene is built on first use."""
+"""Renders JPEG images of a watched world in any light; the scene is built at first use."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -11,12 +11,12 @@ from simulator.world.world import World
 from trackfeatures.camera import CameraParameters
 
 SIZE: Final = (560, 420)
-"""Width, height: twice the driver view's pixels each way."""
+"""Width and height in px: twice those of the driver view."""
 QUALITY: Final = 82
 
 
 class JpegRenderer:
-    """Renders worlds on one road as JPEG images; call from one thread."""
+    """Renders worlds on one road as JPEG images. Only one thread may use it."""
 
     def __init__(self, road: Road, light: str, seed: int = 0) -> None:
         check_light(light)
@@ -25,21 +25,21 @@ class JpegRenderer:
         self._camera: Camera | None = None
 
     def set_light(self, light: str) -> None:
-        """Set the light from the next image on. Raises UserError for an unknown light."""
+        """Set the light of later images. Raises UserError for an unknown light."""
         check_light(light)
         if light != self.light:
             self.light = light
             self.close()
 
     def open(self) -> Camera:
-        """The camera, made on first use. Raises NoRendererError where nothing can draw."""
+        """Return the camera, made at first use. Raises NoRendererError if nothing can render."""
         if self._camera is None:
             parameters = CameraParameters(*SIZE)
             self._camera = open_camera(self.road, parameters, light=self.light, seed=self._seed)
         return self._camera
 
     def render(self, world: World, views: Sequence[str]) -> dict[str, bytes]:
-        """JPEGs of `world` now, by view."""
+        """Return JPEGs of the current state of `world`, by view."""
         if not views:
             return {}
         images = self.open().render_views(world.body_pose(), world.traffic.poses(), views)

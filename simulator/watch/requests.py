@@ -23,11 +23,11 @@ class BrowserRequest:
 
 
 class BadRequest(UserError):
-    """A message that does not follow the page's protocol."""
+    """Raised for a message that does not follow the page's protocol."""
 
 
 def parse(text: str) -> BrowserRequest:
-    """The request in a JSON message {KIND: VALUE}. Raises BadRequest for anything else."""
+    """Parse a JSON message {KIND: VALUE} to a request. Raises BadRequest for any other text."""
     try:
         message = json.loads(text) if len(text) <= MAX_BYTES else None
     except (ValueError, RecursionError):

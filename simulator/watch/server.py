@@ -1,6 +1,6 @@
 """The web server of a watched drive: one page, and one WebSocket per browser.
 
-A thread of its own, so that the drive keeps the main thread.
+It runs in its own thread, so that the drive keeps the main thread.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ POLICY: Final = (
 
 
 def create_app(hub: Hub) -> FastAPI:
-    """The application around `hub`."""
+    """Create the web application for `hub`."""
     app = FastAPI(title="driverview: a live drive", openapi_url=None)
 
     @app.get("/")
@@ -68,7 +68,7 @@ def create_app(hub: Hub) -> FastAPI:
 
 
 async def _send(connection: WebSocket, hub: Hub, browser: Browser) -> None:
-    """Send the latest state and image whenever the browser has answered the one before."""
+    """Send the latest state and image as soon as the browser has answered the previous ones."""
     while True:
         await browser.changed.wait()
         browser.changed.clear()
@@ -110,15 +110,15 @@ async def _receive(connection: WebSocket, hub: Hub, browser: Browser) -> None:
 
 
 def _own_page(connection: WebSocket) -> bool:
-    """Whether the request comes from a page of this server, not from another site's page."""
+    """Return whether the request comes from a page of this server, not of another site."""
     origin = connection.headers.get("origin")
-    if origin is None:  # not a browser: browsers always send an origin
+    if origin is None:  # not a browser, since browsers always send an origin
         return True
     return urlsplit(origin).netloc == connection.headers.get("host")
 
 
 class Server:
-    """Serves `hub` on a bound socket from a thread, until `stop`."""
+    """Serves `hub` on a bound socket, in a thread, until `stop`."""
 
     def __init__(self, hub: Hub, listener: socket.socket) -> None:
         self._listener = listener
@@ -128,7 +128,7 @@ class Server:
         )
 
     def start(self) -> None:
-        """Raises UserError when the server does not come up."""
+        """Start the thread. Raises UserError if the server does not start within START_S."""
         self._thread.start()
         deadline = time.monotonic() + START_S
         while not self._server.started:
@@ -137,7 +137,7 @@ class Server:
             time.sleep(0.005)
 
     def stop(self) -> None:
-        """Close all connections and end the thread; browsers show that the drive is over."""
+        """Close all connections and end the thread; browsers show that the drive has ended."""
         self._server.should_exit = self._server.force_exit = True  # does not wait for browsers
         self._thread.join(STOP_S)
         self._listener.close()

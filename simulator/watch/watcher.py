@@ -22,26 +22,26 @@ SHOW_S: Final = 1.0 / 20.0
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """A driver's estimate of the road, drawn beside the true values."""
+    """A driver's estimate of its position, drawn beside the true values."""
 
     to_middle: float | None
-    """m, left positive; None if it is unknown."""
+    """m, left positive; None if unknown."""
     angle: float
     """rad, track tangent minus yaw."""
 
     def as_dict(self) -> dict[str, float | None]:
-        """The estimate's entries of the state message."""
+        """Return the estimate's entries of the state message."""
         offset = None if self.to_middle is None else round(self.to_middle, 3)
         return {"to_middle": offset, "angle": round(self.angle, 5)}
 
 
 class Watcher:
-    """Shows the world of the argument of `update` in the browser, at the address `url`.
+    """Shows the world given to `update` in the browser, at the address `url`.
 
-    Without a browser an update costs microseconds; with one, at most 20 pictures a second are
-    taken. `speed` limits the drive to this multiple of real time, None sets no limit; `seed` fixes
-    the scenery. Use it from the thread that steps the environment. Raises UserError when the port
-    is in use.
+    Without a browser an update costs microseconds; with browsers, at most 20 pictures per second
+    are drawn. `speed` limits the drive to this multiple of real time; None sets no limit. `seed`
+    determines the scenery. Only the thread that steps the environment may use it. Raises UserError
+    if the port is in use.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Watcher:
         sys.stderr.write(f"watch at {self.url}\n")
 
     def update(self, drive: Any, perceived: Perceived | None = None) -> None:
-        """Show the present state of `drive`: a World, or an environment of this package, wrapped or
-        not; `perceived` is its driver's estimate of the road.
+        """Show the current state of `drive`, which is a World or an environment of this package,
+        wrapped or not. `perceived` is the driver's estimate of its position.
 
-        Call it after every reset and step. Raises UserError for anything else, NoRendererError
-        without a renderer.
+        Call it after every reset and step. Raises UserError for any other object, and
+        NoRendererError without a renderer.
         """
         world = _world_of(drive)
         if world.road is not self._road:
@@ -88,7 +88,7 @@ class Watcher:
             self._pacer.wait()
 
     def close(self) -> None:
-        """End the server; browsers show that the drive is over."""
+        """End the server; browsers show that the drive has ended."""
         self._server.stop()
         if self._renderer is not None:
             self._renderer.close()
@@ -109,7 +109,7 @@ class Watcher:
             self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
 
     def _handle_requests(self) -> None:
-        """Handle requests for a light; other requests would change the drive and are ignored."""
+        """Handle requests for another light; ignore others, which would change the drive."""
         requests, _ = self._hub.take_requests()
         for _, request in requests:
             if request.kind == "light" and self._renderer is not None:

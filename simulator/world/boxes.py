@@ -1,7 +1,7 @@
-"""Boxes around cars and in walls, and whether two of them overlap: compiled.
+"""Boxes around cars and in walls, and a test whether two of them overlap, in compiled code.
 
-A box is an array (BOX,): centre (m), its three axes as rows of unit vectors, half extents along
-them (m). World frame, z up.
+A box is an array (BOX,): centre (m), its three axes as rows of unit vectors, half extents along the
+axes (m). World frame, z up.
 """
 
 import math
@@ -15,26 +15,26 @@ from simulator.vehicle.orientation import rotation
 
 CENTRE, AXES, HALF, BOX = 0, 3, 12, 15
 GROUND_CLEARANCE_M = 0.12
-"""From the road to the underside of a car's box."""
+"""Distance from the road to the underside of a car's box."""
 
 
 @compiled
 def box_height(height: float, cg_height: float) -> tuple[float, float]:
-    """(half of a car's box height, height of the box's centre over the centre of gravity) in m."""
+    """Return half the height of a car's box, and its centre's height over the CG, in m."""
     half = 0.5 * (height - GROUND_CLEARANCE_M)
     return half, GROUND_CLEARANCE_M + half - cg_height
 
 
 @compiled
 def box_radius(p: Any) -> float:
-    """Largest distance (m) of any point of a car's box from its centre of gravity."""
+    """Return the largest distance (m) of a point of a car's box from its centre of gravity."""
     half, above = box_height(p.height, p.cg_height)
     return math.sqrt(0.25 * (p.length**2 + p.width**2) + (half + abs(above)) ** 2)
 
 
 @compiled
 def fill_car_box(p: Any, motion: FloatArray, box: FloatArray) -> None:
-    """Fill the `box` of a car with the parameters `p` and the motion (13,)."""
+    """Fill the `box` (BOX,) of a car with the parameters `p` and the motion (13,)."""
     half, above = box_height(p.height, p.cg_height)
     axes = rotation(motion[3:7])
     for i in range(3):
@@ -46,10 +46,10 @@ def fill_car_box(p: Any, motion: FloatArray, box: FloatArray) -> None:
 
 @compiled
 def boxes_overlap(a: FloatArray, b: FloatArray, margin: float) -> bool:
-    """Whether the gap between two boxes is at most `margin` m along every separating axis.
+    """Return whether the gap between two boxes is at most `margin` m along every separating axis.
 
-    The separating-axis theorem for oriented boxes (Gottschalk et al., OBBTree, SIGGRAPH 1996). With
-    a margin of 0 the boxes overlap or touch.
+    Method: the separating-axis theorem for oriented boxes (Gottschalk et al., OBBTree, SIGGRAPH
+    1996). With a margin of 0 the boxes overlap or touch.
     """
     cosines, across = np.empty((3, 3)), np.empty(3)
     for i in range(3):

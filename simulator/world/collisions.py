@@ -1,8 +1,8 @@
 """Physics steps with contacts: PyBullet moves the ego car, wrecks and nearby traffic.
 
 This code runs while the ego car touches something or a wreck is moving; otherwise the compiled code
-of `free_motion` moves the ego car. A traffic car that is hit becomes a wreck: it leaves traffic and
-moves as a rigid body. PyBullet is imported at the first contact of the process. World frame, SI
+of `free_motion` moves the ego car. A traffic car that is hit becomes a wreck: it leaves the traffic
+and moves as a rigid body. PyBullet is imported at the first contact of the process. World frame, SI
 units.
 """
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from simulator.world.physics import PhysicsClient
 
 CONTACT_MARGIN_M = 0.02
-"""PyBullet's contact threshold: bodies with a larger gap do not act on each other."""
+"""PyBullet's contact threshold; bodies with a larger gap have no effect on each other."""
 STEP_MARGIN_M = 1.0
-"""Largest motion (m) of two bodies towards each other in one physics step, for the choice of the
-bodies that take part in it."""
+"""Upper bound on the distance (m) that two bodies approach each other in one physics step. Bodies
+within it take part in the step."""
 
 
 class ContactPhysics:
@@ -50,7 +50,7 @@ class ContactPhysics:
         self._wrench, self._lane_motion = np.zeros(6), np.zeros(MOTION)
 
     def start(self, traffic: Traffic) -> None:
-        """Begin an episode with `traffic`; all state of the one before is discarded."""
+        """Begin an episode with `traffic`; all state of the previous episode is discarded."""
         self._traffic = traffic
         self._has_bodies = False
         self._active: list[int] = []
@@ -58,7 +58,7 @@ class ContactPhysics:
 
     @property
     def has_moving_wrecks(self) -> bool:
-        """Whether a wreck is still moving, so that PyBullet must run every step."""
+        """Whether a wreck is still moving; PyBullet must then compute every step."""
         return bool(self._wrecks) and any(wreck.moving for wreck in self._wrecks.values())
 
     def step(
@@ -75,7 +75,7 @@ class ContactPhysics:
 
         others (n, 6) and move (n, 6): ground poses of the traffic at the start of the control step
         of `dt` s, and their change over it; share: fraction of the control step already done.
-        Returns what the ego car touched; if both, "traffic" rather than "wall". Raises
+        Returns what the ego car touched; "traffic" has priority over "wall". Raises
         ContactsUnavailable without PyBullet.
         """
         physics = self._bodies()
@@ -104,7 +104,7 @@ class ContactPhysics:
             self._client = None
 
     def _bodies(self) -> "PhysicsClient":
-        """The PyBullet client with the bodies of this episode."""
+        """Return the PyBullet client with the bodies of this episode."""
         if self._client is None:
             self._client = _connect()
         if not self._has_bodies:
@@ -133,7 +133,7 @@ class ContactPhysics:
     def _select_nearby(
         self, physics: "PhysicsClient", motion: FloatArray, places: FloatArray
     ) -> None:
-        """Select the traffic in the next step: moving wrecks, and cars near them or the ego car."""
+        """Select the traffic for the next step: moving wrecks, cars near them or the ego car."""
         moving = [row for row, wreck in self._wrecks.items() if wreck.moving]
         centres = [motion[:2], *(self._wrecks[row].motion[:2] for row in moving)]
         near = set(moving)
@@ -160,7 +160,7 @@ class ContactPhysics:
         return "wall" if touched else None
 
     def _make_wreck(self, row: int) -> None:
-        """Move traffic car `row` by physics from now on."""
+        """Make traffic car `row` a wreck, which physics moves from then on."""
         if row in self._wrecks:
             self._wrecks[row].moving = True
             return
@@ -169,7 +169,7 @@ class ContactPhysics:
         self._traffic.mark_struck(row)
 
     def _publish_wrecks(self, physics: "PhysicsClient") -> None:
-        """Read the wrecks' motions back and publish their poses to the traffic."""
+        """Read the motions of the wrecks, and pass their poses to the traffic."""
         for row in self._active:
             wreck = self._wrecks.get(row)
             if wreck is not None:
@@ -179,8 +179,8 @@ class ContactPhysics:
 
 
 def _connect() -> "PhysicsClient":
-    """A new PyBullet client. Raises ContactsUnavailable where PyBullet is not installed or fails to
-    load."""
+    """Return a new PyBullet client. Raises ContactsUnavailable if PyBullet is not installed or
+    fails to load."""
     try:
         with _stderr_silenced():
             from simulator.world.physics import PhysicsClient
@@ -195,7 +195,7 @@ def _connect() -> "PhysicsClient":
 
 @contextmanager
 def _stderr_silenced() -> Iterator[None]:
-    """Hide PyBullet's greeting, which it prints to stderr when it is imported."""
+    """Hide the text that PyBullet prints to stderr when it is imported."""
     try:
         kept = os.dup(2)
     except OSError:  # it is closed: nothing to hide

@@ -1,4 +1,4 @@
-"""The rate of the physics, and which control rates it allows."""
+"""The rate of the physics, and a check of control rates."""
 
 from trackfeatures.errors import UserError
 

@@ -1,4 +1,4 @@
-"""The control step of cars that touch nothing, compiled, over the rows of a `fleet`.
+"""The control step of cars that touch nothing, in compiled code, for the rows of a `fleet`.
 
 A car that touches something stops at that physics step; `World.complete` then moves it.
 """
@@ -35,7 +35,7 @@ from simulator.world.free_motion import advance_free
 
 @compiled
 def lend(fleet: Arrays) -> Arrays:
-    """The same arrays without reference counting (`runtime.jit.borrowed`)."""
+    """Return the same arrays without reference counting (`runtime.jit.borrowed`)."""
     cars, params, other, tables, left, right, roads, others, move = fleet
     return (
         borrowed(cars),
@@ -52,7 +52,7 @@ def lend(fleet: Arrays) -> Arrays:
 
 @compiled
 def lend_work(work: Work) -> Work:
-    """The same arrays without reference counting (`runtime.jit.borrowed`)."""
+    """Return the same arrays without reference counting (`runtime.jit.borrowed`)."""
     axes, wheels, slip_gain, velocity, turned, wrench = work
     return (
         borrowed(axes),
@@ -66,8 +66,8 @@ def lend_work(work: Work) -> Work:
 
 @compiled
 def advance_car(number: int, fleet: Arrays, steps: int, work: Work) -> bool:
-    """Advance car `number` by a control step of `steps` physics steps, unless it is left out or
-    touches something. Returns whether the control step is complete; sets DONE."""
+    """Advance car `number` by a control step of `steps` physics steps, until it touches something.
+    Cars that are SKIPPED do not move. Returns whether the control step is complete; sets DONE."""
     cars, params, other, tables, left, right, roads, others, move = fleet
     car = cars[number]
     if car[SKIPPED] != 0.0:
@@ -104,7 +104,7 @@ def advance_car(number: int, fleet: Arrays, steps: int, work: Work) -> bool:
 
 @compiled
 def measure_car(table: Table, car: FloatArray) -> None:
-    """Measure the track state of a car's row, and count its laps: crossing the line adds a lap;
+    """Measure the track state of a car's row and count its laps. Crossing the line adds a lap;
     crossing it backwards subtracts one."""
     track = car[TRACK_AT : TRACK_AT + TRACK_STATE_SIZE]
     before = track[TRACK_S]

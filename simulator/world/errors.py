@@ -4,7 +4,7 @@ from trackfeatures.errors import UserError
 
 
 class ContactsUnavailable(UserError):
-    """The car touched something, and PyBullet, which computes contacts, is not installed.
+    """Raised if the car touches something and PyBullet, which computes contacts, is not installed.
 
-    The episode cannot go on; a reset begins a new one.
+    The episode cannot continue; a reset begins a new one.
     """

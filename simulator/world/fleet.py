@@ -1,6 +1,6 @@
 """Cars and roads as arrays for compiled code: one row per car, one row per road.
 
-A control step reads and writes these arrays only, so that one compiled call can step many cars.
+A control step reads and writes only these arrays, so that one compiled call can step many cars.
 World frame and SI units, as in `world`. Counts and codes are stored as floats.
 """
 
@@ -55,12 +55,12 @@ Arrays = tuple[
     FloatArray,
 ]
 """cars (N, CAR), parameters of the cars (N,) and of a traffic car (1,), tables (P, COLUMNS), left
-and right walls (C,), roads (R, ROAD_SIZE); for each car the poses of its traffic (N, T, 6) at the
-start of the control step, and their change over it (N, T, 6)."""
+and right walls (C,), roads (R, ROAD_SIZE), and for each car the poses of its traffic (N, T, 6) at
+the start of the control step and their change over it (N, T, 6)."""
 
 
 class Fleet:
-    """`count` cars, each on a road of its own or on one that several share."""
+    """`count` cars and their roads; several cars may share a road."""
 
     def __init__(self, count: int) -> None:
         self.cars = np.zeros((count, CAR))
@@ -70,7 +70,7 @@ class Fleet:
         self._tables = _Rows(np.zeros((0, COLUMNS)))
         self._left, self._right = (_Rows(np.zeros(0, np.bool_)) for _ in range(2))
         self._roads = _Rows(np.zeros((0, ROAD_SIZE)))
-        # Roads and tracks by their identity; the objects are kept, so that it stays theirs.
+        # Roads and tracks by id; the objects are kept, so that no other object gets their ids.
         self._row_of: dict[int, tuple[int, Road, Walls]] = {}
         self._table_of: dict[int, tuple[int, int, Track]] = {}
         self._update()
@@ -127,13 +127,13 @@ class Fleet:
 
 
 class _Rows:
-    """An array that grows; its memory doubles, so that many small additions stay cheap."""
+    """An array that grows; its memory doubles when full, so many small additions are fast."""
 
     def __init__(self, empty: NDArray[Any]) -> None:
         self.array = self._memory = empty
 
     def append(self, rows: NDArray[Any]) -> tuple[int, int]:
-        """Append `rows`; returns the index of the first one, and the index after the last one."""
+        """Append `rows`; returns the index of the first row and the index after the last one."""
         begin, end = len(self.array), len(self.array) + len(rows)
         if end > len(self._memory):
             grown = np.zeros((max(end, 2 * begin), *rows.shape[1:]), rows.dtype)

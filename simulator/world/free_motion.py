@@ -1,4 +1,4 @@
-"""Motion of the ego car until its box overlaps a wall or a traffic car, in one compiled call.
+"""Moves the ego car until its box overlaps a wall or a traffic car, in one compiled call.
 
 World frame, SI units.
 """
@@ -35,7 +35,7 @@ def touches(
     margin: float,
     radius: float,
 ) -> bool:
-    """Whether the ego car's box is within `margin` m of a wall or a traffic car.
+    """Return whether the ego car's box is within `margin` m of a wall or a traffic car.
 
     params, other: `CarParameters.packed()` of the ego car and of a traffic car; at: the ego car's
     position (see `locate`); others (n, 6): ground poses of the traffic at the start of the control
@@ -86,8 +86,8 @@ def advance_free(
 ) -> int:
     """Advance the ego car from physics step `done` of `steps` until it touches something.
 
-    `margin` (m) as in `touches` applies before the first of these steps, and 0 afterwards. Returns
-    the number of steps then done. `work` is memory for the steps.
+    `margin` (m) as in `touches` applies to the first step; it is 0 for later steps. Returns the
+    number of steps then done. `work` is memory for the steps.
     """
     p, axes, wrench = params[0], work[0], work[5]
     forget_turn(work)

@@ -1,4 +1,4 @@
-"""Pacing of simulated time by the wall clock, and measurement of the rate reached."""
+"""Paces simulated time by the wall clock, and measures the rate reached."""
 
 import time
 from collections import deque
@@ -9,9 +9,9 @@ from trackfeatures.errors import UserError
 
 SPEEDS: Final = (0.05, 100.0)
 MAX_CATCH_UP_S: Final = 0.25
-"""Delays of a watched drive that are longer than this are not made up."""
+"""Longest delay (s) of a watched drive that is caught up."""
 WINDOW_S: Final = 1.5
-"""Time over which a rate is measured."""
+"""Length of the time window (s) in which a rate is measured."""
 
 
 def check_speed(speed: float) -> None:
@@ -24,7 +24,7 @@ def check_speed(speed: float) -> None:
 
 
 class Rate:
-    """Amount per second of wall-clock time, over the last WINDOW_S."""
+    """Measures an amount per second of wall-clock time, over the last WINDOW_S."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -32,7 +32,7 @@ class Rate:
         self._sum = 0.0
 
     def add(self, amount: float) -> None:
-        """Add an amount at the present time."""
+        """Add an amount at the current time."""
         now = self._clock()
         self._sum += amount
         self._marks.append((now, self._sum))
@@ -41,7 +41,7 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """Amount per second; 0 while there is too little data."""
+        """Amount per second; 0 if there are too few data."""
         if len(self._marks) < 2:
             return 0.0
         first, before = self._marks[0]
@@ -50,7 +50,7 @@ class Rate:
 
 
 class Pacer:
-    """Paces steps of `step_s` simulated seconds to one per `step_s / speed` wall-clock s."""
+    """Paces steps of `step_s` simulated seconds to one per `step_s / speed` wall-clock seconds."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Pacer:
         self.restart()
 
     def restart(self) -> None:
-        """Start the timing anew: the next step is due one interval from now."""
+        """Restart the timing: the next step is due one interval from now."""
         self._due = self._clock() + self._interval
 
     @property
@@ -78,7 +78,7 @@ class Pacer:
 
     def wait(self) -> bool:
         """Sleep until the next step is due. Returns whether it was late by more than `catch_up_s`;
-        a delay beyond that is not made up."""
+        such a delay is not caught up."""
         ahead = self._due - self._clock()
         late = ahead < -self._catch_up_s
         if ahead > 0.0:

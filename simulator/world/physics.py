@@ -1,6 +1,6 @@
 """Cars and wall panels as rigid bodies in PyBullet, one DIRECT client per world.
 
-Import this module only where a contact has to be computed: PyBullet is an optional package.
+Import this module only where a contact must be computed, because PyBullet is an optional package.
 Positions in m, world frame, z up; quaternions (x, y, z, w). A body's origin is its centre of
 gravity.
 """
@@ -30,8 +30,8 @@ Motion = NDArray[np.float64]
 class PhysicsClient:
     """The bodies of one world; only this class calls PyBullet.
 
-    `cars` are the PyBullet ids of the cars, the ego car first. `walls` holds one wall panel per
-    car, which collides with that car only.
+    `cars` are the PyBullet ids of the cars, the ego car first. `walls` are the ids of one wall
+    panel per car; a panel collides only with its car.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class PhysicsClient:
         pybullet.resetBaseVelocity(body, m[7:10], m[10:], physicsClientId=client)
 
     def place_wall(self, body: int, panel: Panel) -> None:
-        """Place a wall panel."""
+        """Move the wall panel `body` to the position `panel`."""
         turn = [0.0, 0.0, math.sin(0.5 * panel.yaw), math.cos(0.5 * panel.yaw)]
         place = [panel.x, panel.y, panel.z]
         pybullet.resetBasePositionAndOrientation(body, place, turn, physicsClientId=self._client)
@@ -105,7 +105,7 @@ class PhysicsClient:
         motion[:] = (*place, *turn, *velocity, *spin)
 
     def contacts(self) -> Iterator[tuple[int, int]]:
-        """Pairs of bodies in contact in the last step; a pair may occur more than once."""
+        """Yield the pairs of bodies in contact in the last step, some more than once."""
         for contact in pybullet.getContactPoints(physicsClientId=self._client):
             if contact[8] <= 0.0:
                 yield contact[1], contact[2]

@@ -1,8 +1,8 @@
 """The rails and walls along both sides of a road, as the collision geometry near one car.
 
-A car collides with a panel: an upright box, tangent to the wall where the car is nearest to it.
-Unlike a mesh it has no inner edges to catch on, and it is too thick to be crossed within one
-physics step. Metres, world frame.
+A car collides with a panel: an upright box, tangent to the wall at the point nearest to the car.
+Unlike a mesh it has no inner edges on which a car catches, and it is too thick to be crossed within
+one physics step. Metres, world frame.
 """
 
 import math
@@ -21,17 +21,17 @@ from simulator.world.boxes import AXES, CENTRE, HALF
 PANEL = (6.0, 3.0, 8.0)
 """Length, thickness and height of a panel."""
 FOOT_M = 3.0  # depth of the panel below the road
-FAR_ALONG_M = 60.0  # farther along s than this, a part of the track counts as another road
-MIN_BRIDGE_HEIGHT_M = 4.0  # above this height difference, one road is a bridge over the other
+FAR_ALONG_M = 60.0  # parts of the track farther apart along s count as different roads
+MIN_BRIDGE_HEIGHT_M = 4.0  # least height of one road above the other at a bridge
 _STEP_M = 1.0
 _CENTRE_STEP_M = 2.0
-_MIN_RADIUS_M = 1.0  # no wall this near to the centre of a bend
+_MIN_RADIUS_M = 1.0  # least distance of a wall from the centre of a bend
 _ROW = 6
 
 
 WallTable = tuple[float, NDArray[np.bool_], NDArray[np.bool_]]
-"""Walls for compiled code: their distance (m) from the track's centre, and whether the left and the
-right one stand in each of the equal cells (N,) along s."""
+"""Walls for compiled code: their distance (m) from the track's centre, and whether there is a left
+and a right wall in each of N equal cells along s (N,)."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Walls:
         return self.arrays[0]
 
     def panel(self, s: float, to_middle: float, reach: float) -> Panel | None:
-        """The panel of the wall within `reach` m of a car at (s, to_middle), None if there is none.
+        """Return the panel of a wall within `reach` m of a car at (s, to_middle) m; None if there
+        is none.
 
         A car behind the wall (it passed through an opening) gets no panel.
         """
@@ -79,7 +80,7 @@ def panel_beside(
     table: Table, walls: WallTable, s: float, to_middle: float, reach: float, row: FloatArray
 ) -> bool:
     """Fill `row` (x, y, z, yaw of the panel's centre; x, y of its face) for a car at (s, to_middle)
-    within `reach` m of a wall; False if there is none."""
+    m. Returns False if there is no wall within `reach` m."""
     offset = walls[0]
     if not offset - reach < abs(to_middle) < offset:
         return False
@@ -101,8 +102,8 @@ def panel_beside(
 def fill_panel_box(
     table: Table, walls: WallTable, s: float, to_middle: float, reach: float, box: FloatArray
 ) -> bool:
-    """Fill the `box` (`boxes.BOX`,) of the panel beside a car at (s, to_middle); False if there is
-    none within `reach` m."""
+    """Fill the `box` (`boxes.BOX`,) of the panel beside a car at (s, to_middle) m. Returns False if
+    there is no wall within `reach` m."""
     row = np.empty(_ROW)
     if not panel_beside(table, walls, s, to_middle, reach, row):
         return False
@@ -120,7 +121,7 @@ def fill_panel_box(
 
 
 def _wall_present(road: Road, stations: NDArray[Any], side: int) -> NDArray[np.bool_]:
-    """(N,) whether there is a wall on this side at each of `stations` (N,) along s."""
+    """Return whether a wall stands on `side` (1 left, -1 right) at each of `stations` (N,) m."""
     pose = road.track.at(stations, side * road.wall_offset)
     foot = np.column_stack((pose.x, pose.y, pose.z))
     bend = road.track.at(stations).curvature
@@ -131,7 +132,7 @@ def _wall_present(road: Road, stations: NDArray[Any], side: int) -> NDArray[np.b
 def _on_another_road(
     road: Road, stations: NDArray[np.float64], foot: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """(N,) whether a wall foot (N, 3) lies within the edge of a part of the track far along s."""
+    """Return whether each wall foot (N, 3) is within the edge of a part of the track far along."""
     centre = road.track.at(np.arange(0.0, road.track.length_m, _CENTRE_STEP_M))
     points = np.column_stack((centre.x, centre.y, centre.z))
     return covered_elsewhere(stations, foot, points, road.track.length_m, road.edge)
@@ -145,15 +146,15 @@ def covered_elsewhere(
     length: float,
     edge: float,
 ) -> NDArray[np.bool_]:
-    """(N,) whether each of `foot` (N, 3) at `stations` (N,) lies within `edge` m of a point of the
-    centre line `centre` (M, 3), spaced _CENTRE_STEP_M, that is far along s."""
+    """Return whether each of `foot` (N, 3) at `stations` (N,) lies within `edge` m of a point of
+    the centre line `centre` (M, 3), spaced _CENTRE_STEP_M, that is far away along s."""
     covered = np.zeros(foot.shape[0], dtype=np.bool_)
     for i in range(foot.shape[0]):
         k = 0
         while k < centre.shape[0]:
             apart = math.hypot(foot[i, 0] - centre[k, 0], foot[i, 1] - centre[k, 1])
             if apart >= edge:
-                # Skip the points that cannot lie within the edge: distance along the line is
+                # Skip the points that cannot lie within the edge: a distance along the line is
                 # never less than the straight distance.
                 k += max(int((apart - edge) / _CENTRE_STEP_M), 1)
                 continue

@@ -1,6 +1,6 @@
 """The simulated world: one ego car on one road with walls and traffic, stepped at 200 Hz.
 
-Compiled code moves the ego car until it touches a wall or another car (`free_motion`); then, and
+Compiled code moves the ego car until it touches a wall or another car (`free_motion`). Then, and
 while wrecks move, PyBullet computes the contacts (`collisions`). World frame: x, y in the plane, z
 up, yaw counter-clockwise; s and to_middle in the track frame.
 """
@@ -69,15 +69,16 @@ from trackfeatures.errors import UserError
 __all__ = ["CarState", "Command", "World"]
 
 BACKWARDS_SPEED_M_S = -0.5
-"""Below this speed along the track, the car drives backwards."""
+"""Below this speed along the track, the car counts as driving backwards."""
 MAX_START_SPEED_M_S = 150.0
 
 
 class World:
-    """One episode at a time; `reset` starts one, `step` holds a command for 1/frequency_hz s.
+    """A simulated car with its surroundings; `reset` starts an episode, `step` advances
+    1/frequency_hz s.
 
-    The ego car is car `number` of `fleet`, by default of a fleet of its own. Whoever steps a whole
-    fleet calls `begin`, the compiled step, and `complete`; `step` does the same for one car.
+    The ego car is car `number` of `fleet`, by default of its own fleet. A caller that steps a whole
+    fleet calls `begin`, the compiled step, and `complete`; `step` does this for one car.
     """
 
     def __init__(
@@ -130,9 +131,9 @@ class World:
         speed: float = 0.0,
     ) -> CarState:
         """Start an episode. `s` (m) defaults to 25 m before the line; `angle` is track tangent
-        minus yaw (rad, positive when the car points to the right); `speed` in m/s along the body.
+        minus yaw (rad, positive if the car points to the right); `speed` is in m/s along the body.
 
-        The episode depends on the arguments only, not on earlier episodes. Raises UserError for a
+        The episode depends only on the arguments, not on earlier episodes. Raises UserError for a
         value out of range.
         """
         if self._closed:
@@ -154,7 +155,7 @@ class World:
         return self.state
 
     def step(self, command: Command) -> CarState:
-        """Hold `command` for one control step; raises UserError for a value out of its range."""
+        """Apply `command` for one control step. Raises UserError for a value out of its range."""
         if not self._started:
             return self.state  # raises
         _fill_controls(command, self._controls)
@@ -166,7 +167,7 @@ class World:
         return self.state
 
     def begin(self) -> None:
-        """Begin a control step: move the traffic; leave a car among moving wrecks to PyBullet."""
+        """Begin a control step: move the traffic, and mark a car among moving wrecks as SKIPPED."""
         self._row[TOUCHED] = self._row[DONE] = self._row[SKIPPED] = 0.0
         if self._traffic_count:
             self._advance_traffic(self.state)
@@ -180,7 +181,7 @@ class World:
         measure_car(self._table, self._row)
 
     def features(self) -> tf.TrackFeatures:
-        """The true track features of the present moment.
+        """Return the true track features of the current state.
 
         Distances are measured in the road plane, from the foot of the centre of gravity on it.
         """
@@ -190,7 +191,7 @@ class World:
         return self.road.measure(now.s, offset, now.angle)
 
     def body_pose(self) -> FloatArray:
-        """x, y, z, roll, pitch, yaw of the centre of gravity (6,), as PyBullet's Euler angles."""
+        """Return x, y, z, roll, pitch, yaw (6,) of the centre of gravity (PyBullet's angles)."""
         now = self.state
         return np.array([now.x, now.y, now.z, now.roll, now.pitch, now.yaw])
 
@@ -206,7 +207,7 @@ class World:
         self.close()
 
     def _place(self, s: float, to_middle: float, angle: float, speed: float) -> None:
-        """Place the car on its wheels at (s, to_middle), rolling at `speed`."""
+        """Place the car on its wheels at (s, to_middle) m, rolling at `speed` m/s."""
         piece = index_at(self._table, s)
         wrapped = s % self.road.track.length_m
         pose = self.road.track.at(s, to_middle)
@@ -278,7 +279,7 @@ class World:
         )
 
     def _build_state(self) -> CarState:
-        """The state of the ego car, from its row."""
+        """Build the state of the ego car from its row."""
         row = self._row.tolist()
         motion, memory, track = row[MOTION_AT:], row[MEMORY_AT:], row[TRACK_AT:]
         return CarState(
@@ -312,7 +313,7 @@ class World:
 def check_place(
     road: Road, s: float = 0.0, to_middle: float = 0.0, angle: float = 0.0, speed: float = 0.0
 ) -> None:
-    """Raises UserError unless a drive can start there; the arguments are those of `World.reset`."""
+    """Raises UserError unless a drive can start there; arguments as in `World.reset`."""
     for name, value in (("s", s), ("to_middle", to_middle), ("angle", angle)):
         if not math.isfinite(value):
             raise UserError(f"reset got {name} = {value}; give a finite number")
@@ -334,7 +335,7 @@ def check_seed(seed: int) -> None:
 def _fill_controls(command: Command, controls: FloatArray) -> None:
     """Check `command` and write (steer, throttle, brake, gear) into `controls` (4,)."""
     steer, throttle, brake, gear = command.steer, command.throttle, command.brake, command.gear
-    # Comparisons with NaN are false, so these hold for it as well.
+    # Comparisons with NaN are false, so NaN is treated as out of range.
     if not (-1.0 <= steer <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
         steer = clip_rounding(steer, -1.0, 1.0)
         throttle, brake = clip_rounding(throttle, 0.0, 1.0), clip_rounding(brake, 0.0, 1.0)

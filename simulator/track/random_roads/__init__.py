@@ -1,1 +1,1 @@
-"""Random roads: `random:SEED` is a closed road that is a function of its seed."""
+"""Random roads: `random:SEED` is a closed road that its seed determines."""

@@ -1,4 +1,4 @@
-"""Checks that no part of a closed course comes too near to another part. Metres."""
+"""Checks that no part of a closed course is too near to another part. Metres."""
 
 import math
 from typing import Final
@@ -9,20 +9,20 @@ from simulator.arrays import FloatArray
 from simulator.track.layout import Segment, cut, place
 
 CLEARANCE_M: Final = 24.0
-"""Least distance between the centre lines of two parts of the road. Walls up to 12 m from the
-centre line then never meet, nor do the inner walls of the tightest bend (12 m). A road of three
+"""Least distance between the centre lines of two parts of the road. With it, walls up to 12 m from
+the centre line never meet, nor do the inner walls of the tightest bend (12 m). A road of three
 lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500
 BULGE_M: Final = 0.3
-"""Largest distance of a bend from the chord of a piece (5 m long, radius 12 m: 0.26 m)."""
+"""Largest distance between a bend and the chord of a piece (5 m long, radius 12 m: 0.26 m)."""
 
 
 def keeps_clear(segments: list[Segment]) -> bool:
-    """Whether no two parts of a closed course are nearer than `CLEARANCE_M`.
+    """Return whether all parts of a closed course are at least `CLEARANCE_M` apart.
 
-    Points less than half a circle of diameter `CLEARANCE_M` apart along the road are not compared:
-    they are on one bend, and no radius is below half of `CLEARANCE_M`.
+    Points whose distance along the road is less than half a circle of diameter `CLEARANCE_M` are
+    not compared: they lie in one bend, and no radius is below half of `CLEARANCE_M`.
     """
     placed = place(cut(segments))
     total = float(placed.s0[-1] + placed.length[-1])
@@ -33,16 +33,16 @@ def keeps_clear(segments: list[Segment]) -> bool:
     x = np.interp(s, nodes, np.append(placed.x0, placed.end[0]))
     y = np.interp(s, nodes, np.append(placed.y0, placed.end[1]))
     near = math.ceil(math.pi / 2.0 * CLEARANCE_M / step)
-    # Two lines at `CLEARANCE_M` may be sampled half a step apart along them, round a tight bend.
+    # In a tight bend, samples of two lines can be half a step apart along the lines.
     least = CLEARANCE_M + BULGE_M + step * step / 64.0
-    # Each pair once: every sample is compared with the samples up to half a lap ahead.
+    # Each sample is compared with the samples up to half a lap ahead, so each pair once.
     ahead_x, ahead_y = (_ahead(values, near, count // 2 + 1) for values in (x, y))
     dx, dy = ahead_x - x[:, None], ahead_y - y[:, None]
     return bool((dx * dx + dy * dy).min() >= least * least)
 
 
 def _ahead(values: FloatArray, first: int, last: int) -> FloatArray:
-    """The values (N, last - first) that lie `first` to `last` positions after each of `values`
-    (N,), round the lap."""
+    """Return for each of `values` (N,) the values (N, last - first) that lie `first` to `last`
+    positions after it, round the lap."""
     lap = np.concatenate((values, values))
     return np.lib.stride_tricks.sliding_window_view(lap, last)[: len(values), first:]

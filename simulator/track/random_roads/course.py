@@ -1,7 +1,7 @@
 """The course of a random road in the plane: a polygon whose corners are rounded to bends.
 
-A polygon is closed, so the road closes without a search. Metres; angles in degrees, left positive,
-in the resolution of the file.
+A polygon is closed, so the road closes without a search. Lengths are in metres, angles in degrees,
+left positive; both have the resolution of the TOML file.
 """
 
 import math
@@ -16,22 +16,23 @@ from simulator.track.random_roads.kinds import Kind
 
 MIN_STRAIGHT_M: Final = 1.0
 MIN_BEND_M: Final = 8.0
-"""Least length of a bend; a shorter one would be a kink."""
+"""Least length of a bend; a shorter bend would be a kink."""
 MIN_TURN_DEG: Final = 0.5
 SHARP_DEG: Final = 35.0
 """Least turn of a corner that may consist of several arcs."""
 MIN_BANKED_SPIRAL_M: Final = 8.0
 RANK_NOISE: Final = 0.6
-"""Noise on the logarithm of the room for a bend: small radii mostly go to narrow corners."""
+"""Noise on the logarithm of the largest radius that fits each corner. Corners are sorted by it, so
+that small radii mostly are in corners with little room."""
 
 
 class DoesNotFit(Exception):
-    """This polygon leaves no room for a bend; another random polygon is tried."""
+    """Raised if a polygon leaves no room for a bend; the caller tries another random polygon."""
 
 
 @dataclass(frozen=True)
 class Arc:
-    """Part of a bend: one row of the file."""
+    """An arc of a bend; it is one row of the TOML file."""
 
     radius: float
     angle: float
@@ -42,7 +43,7 @@ class Arc:
         return Bend(self.radius, math.radians(self.angle), self.spiral, 0.0, 0.0)
 
     def scaled(self, factor: float) -> "Arc":
-        """The arc scaled by `factor`, with spirals that still fit after rounding down."""
+        """Return the arc scaled by `factor`, with spirals rounded down so that they still fit."""
         return replace(
             self,
             radius=round(self.radius * factor, 2),
@@ -55,14 +56,14 @@ Corner = tuple[Arc, ...]
 
 @dataclass(frozen=True)
 class Course:
-    """A closed course: the straight `straights[i]` leads to `corners[i]`."""
+    """A closed course; the straight `straights[i]` (m) leads to `corners[i]`."""
 
     straights: tuple[float, ...]
     corners: tuple[Corner, ...]
 
 
 def draw_course(kind: Kind, unevenness: float, rng: np.random.Generator) -> Course:
-    """A closed course of `kind`, which may cross itself. Raises DoesNotFit."""
+    """Return a random closed course of `kind`; it may cross itself. Raises DoesNotFit."""
     points = _polygon(kind, unevenness, rng)
     edges = np.roll(points, -1, axis=0) - points  # edge i leads from corner i to corner i + 1
     lengths = np.hypot(edges[:, 0], edges[:, 1])
@@ -80,7 +81,7 @@ def draw_course(kind: Kind, unevenness: float, rng: np.random.Generator) -> Cour
 
 
 def _polygon(kind: Kind, unevenness: float, rng: np.random.Generator) -> FloatArray:
-    """Corners (n, 2) round a middle: uneven in angle and distance, stretched along one axis."""
+    """Return random corners (n, 2) round a centre, at uneven angles and distances."""
     count = int(rng.integers(kind.corners[0], kind.corners[1], endpoint=True))
     gaps = rng.uniform(0.65, 1.35, count)
     around = np.cumsum(gaps) * (2.0 * math.pi / gaps.sum())
@@ -95,7 +96,8 @@ def _polygon(kind: Kind, unevenness: float, rng: np.random.Generator) -> FloatAr
 
 
 def _turns(edges: FloatArray) -> FloatArray:
-    """Turn (n,) at the start of each edge, degrees with three decimals; they add up to +-360."""
+    """Return the turn (n,) at the start of each edge, deg with three decimals; their sum is
+    +-360."""
     before = np.roll(edges, 1, axis=0)
     cross = before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0]
     turns = np.degrees(np.arctan2(cross, (before * edges).sum(axis=1)))
@@ -107,8 +109,8 @@ def _turns(edges: FloatArray) -> FloatArray:
 def _corners(
     kind: Kind, turns: FloatArray, largest: FloatArray, rng: np.random.Generator
 ) -> tuple[Corner, ...]:
-    """A bend for each turn. The radii are log-uniform over all bends; small radii go to corners for
-    which the `largest` radius that fits is small."""
+    """Return a bend for each turn. The radii are log-uniform over all bends. Small radii are in
+    corners whose `largest` possible radius is small."""
     count = len(turns)
     low, high = np.log(kind.radius_m)
     radii = np.exp(low + (high - low) * (np.arange(count) + rng.uniform(size=count)) / count)
@@ -122,12 +124,12 @@ def _corners(
 
 
 def _least_radius(turn: float) -> float:
-    """Radius at which a bend of `turn` degrees is just long enough."""
+    """Return the radius (m) at which a bend of `turn` degrees has the length MIN_BEND_M."""
     return MIN_BEND_M / math.radians(abs(turn))
 
 
 def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
-    """One corner that turns by `turn` degrees; its smallest radius is `radius`."""
+    """Return one corner that turns by `turn` degrees; its smallest radius is `radius`."""
     abrupt, compound, spiral, banking = rng.uniform(size=4).tolist()
     if compound < kind.compound and abs(turn) > SHARP_DEG:
         return _compound(kind, turn, radius, rng)
@@ -140,7 +142,7 @@ def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) ->
 
 
 def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
-    """Two or three arcs joined without spirals; the tightest has the radius `radius`."""
+    """Return two or three arcs that join without spirals; the smallest radius is `radius`."""
     count = int(rng.integers(2, 4))
     shares = rng.uniform(0.6, 1.4, count)
     angles = [round(float(a), 3) for a in turn * shares / shares.sum()]
@@ -154,7 +156,7 @@ def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) 
 
 
 def _fitted(kind: Kind, corners: tuple[Corner, ...], room: FloatArray) -> tuple[Corner, ...]:
-    """The corners, shrunk where they need more than `room` of an edge. Raises DoesNotFit."""
+    """Shrink the corners that need more than `room` (n,) of an edge. Raises DoesNotFit."""
     need = np.maximum(*_tangents(corners))
     factors = np.minimum(1.0, 0.995 * room / need).tolist()
     fitted = []
@@ -168,12 +170,12 @@ def _fitted(kind: Kind, corners: tuple[Corner, ...], room: FloatArray) -> tuple[
 
 
 def _without_short_banking(arc: Arc) -> Arc:
-    """The arc without its banking if it is short: a road cannot bank within a few metres."""
+    """Return the arc without banking and spiral if its spiral is too short to bank the road."""
     return arc if arc.spiral >= MIN_BANKED_SPIRAL_M else replace(arc, spiral=0.0, banking=0.0)
 
 
 def _tangents(corners: tuple[Corner, ...]) -> tuple[FloatArray, FloatArray]:
-    """Lengths of the edges before and after it that each corner uses, two (n,) arrays."""
+    """Return the lengths (n,) that each corner uses of the edge before and of the edge after it."""
     bends: list[Segment] = [arc.bend() for corner in corners for arc in corner]
     placed = place(cut(bends))
     lengths = [sum(segment_length(arc.bend()) for arc in corner) for corner in corners]
@@ -190,7 +192,7 @@ def _tangents(corners: tuple[Corner, ...]) -> tuple[FloatArray, FloatArray]:
 
 
 def _closed(before: FloatArray, corners: tuple[Corner, ...]) -> Course:
-    """The course with straights that close the loop, from the middle of the longest straight on."""
+    """Return the course with straights that close the loop; it starts with the longest straight."""
     first = int(np.argmax(before))
     order = [*range(first, len(corners)), *range(first)]
     segments: list[Segment] = []

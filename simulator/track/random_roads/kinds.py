@@ -1,6 +1,6 @@
-"""The kinds of random roads and the ranges that they are drawn from; see kinds.toml.
+"""The kinds of random roads and the ranges of their random values; see kinds.toml.
 
-Lengths in m; ranges are (least, most).
+Lengths in m; ranges are (least, greatest).
 """
 
 import tomllib
@@ -12,33 +12,33 @@ from typing import Any, Final
 import numpy as np
 
 BLOCK: Final = 20
-"""Sum of the shares. `BLOCK` seeds in a row, from a multiple of it, have each kind in its share."""
+"""Sum of the shares: each run of `BLOCK` seeds from a multiple of it has the kinds by share."""
 
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of road."""
+    """The parameters of one kind of random road."""
 
     name: str
     share: int
-    """Roads of this kind among `BLOCK` seeds."""
+    """Number of roads of this kind among `BLOCK` consecutive seeds."""
     corners: tuple[int, int]
-    """Number of corners of a lap."""
+    """Least and greatest number of corners of a lap."""
     edge_m: Range
     """Mean distance from corner to corner."""
     unevenness: float
-    """How much the corners' distance from the middle varies; 0: a round course."""
+    """Amount by which the distance of the corners from the centre varies; 0: a round course."""
     radius_m: Range
-    """Radius of the bends, log-uniform. A bend that does not fit between its neighbours becomes
-    tighter, down to the least radius."""
+    """Radius of the bends, log-uniform. A bend that does not fit between its neighbours gets a
+    smaller radius, down to the least one."""
     abrupt: float
     """Share of the bends that begin and end without a spiral."""
     compound: float
-    """Share of the sharp corners that are two or three arcs of different radii."""
+    """Share of the sharp corners that consist of two or three arcs with different radii."""
     spiral: Range
-    """Length of each spiral, as a share of radius times angle."""
+    """Length of each spiral as a share of radius times angle."""
     banking_deg: Range
     """Banking of bends with spirals."""
     grade_percent: Range
@@ -57,19 +57,19 @@ class Kind:
 
 @cache
 def kinds() -> tuple[Kind, ...]:
-    """All kinds, from kinds.toml."""
+    """Return all kinds of kinds.toml."""
     text = files(__package__).joinpath("kinds.toml").read_text(encoding="utf-8")
     return tuple(_kind(name, row) for name, row in tomllib.loads(text).items())
 
 
 def _kind(name: str, row: dict[str, Any]) -> Kind:
-    """A kind from its table, whose lists become tuples."""
+    """Make a kind from its table in kinds.toml; lists become tuples."""
     fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
     return Kind(name=name, **fields)
 
 
 def kind_of(seed: int) -> Kind:
-    """The kind of the road of `seed`."""
+    """Return the kind of the road of `seed`."""
     block, place = divmod(seed, BLOCK)
     dealt = [kind for kind in kinds() for _ in range(kind.share)]
     return dealt[int(np.random.default_rng([block, 1]).permutation(len(dealt))[place])]

@@ -1,11 +1,12 @@
-"""Random roads: the track `random:SEED`, a function of its seed.
+"""Random roads: the track `random:SEED`, which its seed determines.
 
-Errors of the angle are largest, and biased, in tight bends and at changes of curvature. Few frames
-of other tracks show these; on random roads half of the frames do.
+The errors of the angle are largest, and biased, in tight bends and at changes of curvature. Few
+frames of other tracks show such places; on random roads half of the frames do.
 
-The road is drawn as the content of a TOML file (see `toml_track`), in decimals: the same seed gives
-the same decimals on every machine (numpy's PCG64; rounding to decimals removes the differences of
-sines in the last bits). The hash of the track is the hash of these decimals.
+The road is generated as the content of a TOML file (see `toml_track`), in decimals. The same seed
+gives the same decimals on every machine: the random numbers are those of numpy's PCG64, and
+rounding removes the differences of sines in the last bits. The hash of the track is the hash of
+these decimals.
 """
 
 import json
@@ -32,31 +33,31 @@ from simulator.track.toml_track import Table, build_track, read_segments
 RANDOM: Final = "random"
 MAX_SEED: Final = 2**63 - 1
 CALMER: Final = 0.98
-"""Factor on the unevenness after each course that does not fit, so that one fits in the end."""
+"""Factor on the unevenness after each course that does not fit, so that finally a course fits."""
 DASHES: Final = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))
 Row = dict[str, Any]
 _SEED: Final = re.compile(r"[0-9]{1,19}")
 
 
 def is_random(name: str) -> bool:
-    """Whether `name` has the form of a random road's name, even if it is misspelt."""
+    """Return whether `name` has the form of a random road's name, even if it is misspelt."""
     return name == RANDOM or name.startswith(f"{RANDOM}:")
 
 
 def random_name(seed: int) -> str:
-    """The name of the road of `seed`."""
+    """Return the name of the road of `seed`."""
     return f"{RANDOM}:{seed}"
 
 
 @lru_cache(maxsize=1024)  # a plan needs each track twice; a track takes 70 kB
 def random_track(name: str) -> Track:
-    """The track called `random:SEED`. Raises UnknownTrack for another name."""
+    """Build the track called `random:SEED`. Raises UnknownTrack for any other name."""
     seed = seed_of(name)
     return build_track(Table(road_file(seed), name), random_name(seed))
 
 
 def seed_of(name: str) -> int:
-    """SEED of `random:SEED`. Raises UnknownTrack."""
+    """Return SEED of `random:SEED`. Raises UnknownTrack for any other name."""
     seed = name.removeprefix(f"{RANDOM}:")
     if not _SEED.fullmatch(seed) or int(seed) > MAX_SEED:
         raise UnknownTrack(
@@ -68,7 +69,7 @@ def seed_of(name: str) -> int:
 
 
 def road_file(seed: int) -> dict[str, Any]:
-    """Content of the TOML file of the road of `seed`."""
+    """Return the content of the TOML file of the road of `seed`."""
     kind = kind_of(seed)
     rng = np.random.default_rng([seed, 0])
     about = _about(kind, rng)
@@ -79,7 +80,7 @@ def road_file(seed: int) -> dict[str, Any]:
 
 
 def _about(kind: Kind, rng: np.random.Generator) -> dict[str, Any]:
-    """The entries of the file apart from the segments: look, surface, paint."""
+    """Return random entries of the file other than the segments: look, surface, paint."""
     gravel = bool(rng.uniform() < kind.gravel)
     look = "gravel" if gravel else kind.looks[rng.integers(len(kind.looks))]
     surface = "gravel" if gravel else "concrete" if rng.uniform() < 0.1 else "asphalt"
@@ -105,7 +106,7 @@ def _decimal(limits: tuple[float, float], digits: int, rng: np.random.Generator)
 
 
 def _course_rows(kind: Kind, rng: np.random.Generator) -> list[Row]:
-    """Rows without grades of a course that keeps clear of itself."""
+    """Return the rows, without grades, of a random course whose parts keep their distance."""
     unevenness = kind.unevenness
     while True:
         try:
@@ -119,7 +120,7 @@ def _course_rows(kind: Kind, rng: np.random.Generator) -> list[Row]:
 
 
 def _rows(course: Course) -> list[Row]:
-    """The rows of a lap that starts and ends in the middle of the first straight."""
+    """Return the rows of a lap that starts and ends in the middle of the first straight."""
     half = round(course.straights[0] / 2.0, 3)
     rows: list[Row] = []
     for length, corner in zip((half, *course.straights[1:]), course.corners, strict=True):
@@ -133,8 +134,8 @@ def _read(rows: list[Row]) -> list[Segment]:
 
 
 def _grades(kind: Kind, segments: list[Segment], rng: np.random.Generator) -> list[float]:
-    """Grade of each segment, percent. The road lies on hills, so that neighbouring parts of it have
-    similar heights and the lap closes in height."""
+    """Return the grade of each segment in percent. The road lies on hills, so that neighbouring
+    parts have similar heights and the lap closes in height."""
     placed = place(cut(segments))
     lengths = np.array([segment_length(segment) for segment in segments])
     at = np.concatenate(([0.0], np.cumsum(lengths)))[:-1]
@@ -147,7 +148,7 @@ def _grades(kind: Kind, segments: list[Segment], rng: np.random.Generator) -> li
 
 
 def _hills(kind: Kind, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Heights (n,) at (x, y) of hills of unit size: three waves, each in a direction of its own."""
+    """Return heights (n,) at (x, y): the sum of three waves of slope 1 in random directions."""
     height = np.zeros(len(x))
     for _ in range(3):
         wave = 2.0 * math.pi / float(rng.uniform(*kind.hill_m))
@@ -158,14 +159,14 @@ def _hills(kind: Kind, x: FloatArray, y: FloatArray, rng: np.random.Generator) -
 
 
 def write_road(seed: int, path: Path) -> None:
-    """Write the road of `seed` as a TOML file, which reads back as the same track (see
-    `toml_track`). Raises UserError without the folder, OSError for a full disk."""
+    """Write the road of `seed` as a TOML file that reads back as the same track (see `toml_track`).
+    Raises UserError if the folder is missing, OSError if the disk is full."""
     comment = f"# {random_name(seed)}: a random road of the kind {kind_of(seed).name}."
     atomic_write(path, "\n".join([comment, *_lines(road_file(seed))]) + "\n")
 
 
 def _lines(content: Mapping[str, Any]) -> Iterator[str]:
-    """The lines of a TOML file; for plain strings, booleans and numbers its values are JSON's."""
+    """Yield the lines of a TOML file; JSON writes its strings, booleans and numbers equally."""
     for key, value in content.items():
         if not isinstance(value, dict | list):
             yield f"{key} = {json.dumps(value)}"

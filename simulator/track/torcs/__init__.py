@@ -1,1 +1,1 @@
-"""Import of TORCS track files (XML)."""
+"""Imports TORCS track files (XML)."""

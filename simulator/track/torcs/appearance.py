@@ -1,7 +1,7 @@
-"""Chooses the look of an imported TORCS track from its category, surface, name and height.
+"""Selects the scenery of an imported TORCS track from its category, surface, name and height.
 
-TORCS keeps scenery in 3D models, which are not read. A name without a known word gets a random look
-of those that suit a track with, or without, kerbs.
+TORCS stores scenery in 3D models, which are not read. A track whose name contains no word of NAMED
+gets a random look that suits a track with, or without, kerbs.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ from simulator.track.pieces import Placed
 from simulator.track.torcs.torcs_xml import Section
 
 MOUNTAIN_HEIGHT_M: Final = 55.0
-"""A track that climbs more than this gets mountain scenery."""
+"""Least difference in height with which a track gets mountain scenery."""
 NAMED: Final = (
     ("mountain", ("alpine", "mountain", "pass", "hill")),
     ("town", ("street", "city", "town")),
@@ -23,7 +23,7 @@ NAMED: Final = (
     ("countryside", ("ole-road", "spring")),
     ("circuit", ("forza", "wheel", "brondehach")),
 )
-"""Looks by words in a track's name."""
+"""Look for words that a track's name contains; the first match is used."""
 WITH_KERBS: Final = ("circuit", "forest", "circuit", "countryside")
 WITHOUT_KERBS: Final = ("countryside", "forest", "ring-road", "highway")
 
@@ -31,7 +31,7 @@ WITHOUT_KERBS: Final = ("countryside", "forest", "ring-road", "highway")
 def surface_and_look(
     name: str, root: Section, main: Section, placed: Placed
 ) -> tuple[Surface, str]:
-    """Surface and look of the track called `name`."""
+    """Return the surface and the look (scenery theme) of the track called `name`."""
     surface = _surface(root, main)
     if surface == "gravel":
         return surface, "gravel"
@@ -48,7 +48,7 @@ def surface_and_look(
 
 
 def has_kerbs(main: Section) -> bool:
-    """Whether any segment of the track has a kerb beside it."""
+    """Return whether any segment of the track has a kerb beside it."""
     return any(
         "curb" in (attribute.get("val") or "").lower()
         for attribute in main.element.iter("attstr")

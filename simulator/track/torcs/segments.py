@@ -1,7 +1,7 @@
 """Converts TORCS segments to pieces: profile steps, spirals, heights, banking, as in TORCS 1.3.7.
 
-Everything is in SI units and at the centre line; TORCS's own terms are kept (`profil`). Attributes
-unknown to TORCS (misspelt ones, too) have no effect.
+All values are in SI units and at the centre line. The attributes have TORCS's names (`profil`).
+Attributes that TORCS does not know, for example misspelt ones, have no effect.
 """
 
 import math
@@ -22,13 +22,13 @@ MAX_STEPS: Final = 100_000
 
 
 Edges = NDArray[np.float64]
-"""(2,) a value for the left and the right edge of the road: a height (m) or a slope (dz/ds)."""
+"""Values (2,) for the left and the right edge of the road: heights (m) or slopes (dz/ds)."""
 
 
 @dataclass
 class Profile:
-    """Values that a segment passes to the next segment: end heights, end slopes, and the grade,
-    which holds until a segment states another grade."""
+    """Values that a segment passes to the next segment: heights and slopes of the edges at its end,
+    and the grade, which holds until a segment sets another grade."""
 
     end: Edges
     tangent: Edges
@@ -36,7 +36,7 @@ class Profile:
 
 
 def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piece]:
-    """The pieces of all segments in order, each segment cut into its profile steps."""
+    """Yield the pieces of all segments in order; each segment is cut into its profile steps."""
     global_step = main.length("profil steps length") or 0.0
     profile = Profile(end=np.zeros(2), tangent=np.zeros(2))
     for segment in segments.sections():
@@ -64,7 +64,7 @@ def _segment_pieces(
 
 
 def _plan(segment: Section) -> tuple[int, float, float, float]:
-    """Turning sign (1 left, 0 straight, -1 right), start and end radius, centre-line length."""
+    """Return turning sign (1 left, 0 straight, -1 right), start and end radius, and length (m)."""
     kind = segment.text("type")
     if kind == "str":
         length = segment.length("lg") or 0.0
@@ -102,7 +102,7 @@ def _check_length(segment: Section, name: str, value: float) -> None:
 def _end_heights(
     segment: Section, profile: Profile, width: float, length: float
 ) -> tuple[Edges, Edges]:
-    """Heights of both edges at the start and at the end of a segment."""
+    """Return the heights (m) of both edges at the start and at the end of a segment."""
     start = _edges(segment.length, "z start", profile.end)
     end = _edges(segment.length, "z end", profile.end)
     grade = segment.number("grade")
@@ -118,7 +118,7 @@ def _end_heights(
 
 
 def _edges(read: Callable[[str], float | None], name: str, default: Edges) -> Edges:
-    """The attribute `name`, given for both edges or one by one, else `default`."""
+    """Return the attribute `name`, given for both edges or for each, else `default`."""
     left, right = (read(f"{name} {side}") for side in ("left", "right"))
     both = read(name)
     if both is not None:
@@ -153,7 +153,7 @@ def _step_count(segment: Section, length: float, global_step: float) -> int:
 def _tangents(
     segment: Section, profile: Profile, start: Edges, end: Edges, length: float, spline: bool
 ) -> tuple[Edges, Edges]:
-    """Slopes of both edges at the start and at the end of the profile."""
+    """Return the slopes of both edges at the start and at the end of the profile."""
     if not spline:
         chord: Edges = (end - start) / length
         return chord, chord
@@ -167,7 +167,7 @@ def _tangents(
 def _steps(
     steps: int, length: float, radius: float, radius_end: float, arc: float
 ) -> tuple[list[float], list[float]]:
-    """Length and radius of every step; a spiral's steps are scaled to turn by `arc` in all."""
+    """Return length and radius of every step; a spiral's steps together turn by `arc` rad."""
     step = length / steps
     if radius == radius_end or steps == 1:
         # A single step has only the start radius, so its length follows from the arc.
@@ -182,7 +182,7 @@ def _steps(
 def _hermite(
     start: Edges, end: Edges, tangents: tuple[Edges, Edges], length: float, t: float
 ) -> Edges:
-    """Cubic through both ends with the given slopes, at the share t of the segment."""
+    """Return the heights at the share `t` of the segment, by a cubic with these end slopes."""
     if t == 1.0:
         return end
     h_end = t * t * (3.0 - 2.0 * t)

@@ -18,10 +18,10 @@ MAX_PIECES: Final = 200_000
 
 
 def read_torcs(path: Path) -> Track:
-    """The track of one TORCS XML file, named after the file.
+    """Read the track of one TORCS XML file; it is named after the file.
 
-    Raises TrackError for a file that is unreadable or unsafe (see `torcs_xml`), for lengths
-    that are not positive, and for segments that do not close (see `pieces.MAX_GAP_M`).
+    Raises TrackError for a file that is unreadable or unsafe (see `torcs_xml`), for lengths that
+    are not positive, and for segments that do not close (see `pieces.MAX_GAP_M`).
     """
     root = read_parameter_file(path)
     main = _required(root, "Main Track")

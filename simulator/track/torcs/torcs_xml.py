@@ -1,6 +1,6 @@
-"""Reads TORCS parameter files (XML) without trusting them: no DTD, no entities, a size limit.
+"""Reads TORCS parameter files (XML) from untrusted sources: no DTD, no entities, a size limit.
 
-A file is a tree of sections that hold numbers with a unit (`attnum`) and strings (`attstr`).
+A file is a tree of sections, which contain numbers with a unit (`attnum`) and strings (`attstr`).
 """
 
 import codecs
@@ -19,7 +19,7 @@ from simulator.track.errors import TrackError
 from simulator.track.torcs.units import LENGTH, RATIO, UNITS, Dimension, parse_unit
 
 MAX_BYTES: Final = 4 * 2**20
-"""The largest track of TORCS 1.3.7 has 180 kB."""
+"""Limit of a file's size; the largest track of TORCS 1.3.7 has 180 kB."""
 
 _NUMBER = re.compile(
     r"\s*(0[xX][0-9a-fA-F]+|[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*", re.ASCII
@@ -42,21 +42,21 @@ class Section:
         return self.element.get("name", "")
 
     def sections(self) -> Iterator["Section"]:
-        """The direct subsections, in the order of the file."""
+        """Yield the direct subsections in the order of the file."""
         for child in self.element.findall("section"):
             yield Section(child, self.file)
 
     def section(self, name: str) -> "Section | None":
-        """The first direct subsection of that name."""
+        """Return the first direct subsection with this name, or None."""
         return next((child for child in self.sections() if child.name == name), None)
 
     def length(self, name: str) -> float | None:
-        """An `attnum` in m, None where absent; TrackError unless it is a finite number in a unit of
-        length, or without a unit."""
+        """Return an `attnum` in m, None if absent. Raises TrackError unless it is a finite number
+        with a unit of length or without a unit."""
         return self._number(name, LENGTH, "a length")
 
     def number(self, name: str) -> float | None:
-        """An `attnum` that is an angle (rad), a slope or a plain number, as `length`."""
+        """Return an `attnum` that is an angle (rad), a slope or a plain number, like `length`."""
         return self._number(name, RATIO, "an angle, a ratio or a plain number")
 
     def _number(self, name: str, dimension: Dimension, expected: str) -> float | None:
@@ -82,19 +82,20 @@ class Section:
         return value * read.factor
 
     def text(self, name: str) -> str | None:
-        """An `attstr`, None where absent."""
+        """Return an `attstr`, None if absent."""
         attribute = self._attribute("attstr", name)
         return None if attribute is None else attribute.get("val", "")
 
     def _attribute(self, kind: str, name: str) -> Element | None:
-        # If a name occurs twice, the first one counts: TORCS's heights of ruudskogen need this.
+        # If a name occurs twice, the first one is used, as the heights of ruudskogen require.
         return next((c for c in self.element.findall(kind) if c.get("name") == name), None)
 
 
 def _number_in(text: str) -> float:
-    """The number, decimal or hexadecimal ("0x1f"), if it is all of `text`; else NaN.
+    """Return the decimal or hexadecimal ("0x1f") number that is all of `text`; NaN for other texts.
 
-    TORCS reads "1,5" and "1.5.2" as far as it can, and an empty text as 0; these are refused."""
+    TORCS reads "1,5" and "1.5.2" as far as it can, and an empty text as 0; here they give NaN.
+    """
     found = _NUMBER.fullmatch(text)
     if found is None:
         return math.nan
@@ -103,16 +104,16 @@ def _number_in(text: str) -> float:
 
 
 def read_parameter_file(path: Path) -> Section:
-    """The root section of a TORCS parameter file.
+    """Return the root section of a TORCS parameter file.
 
-    Raises TrackError for a file that is too large, not XML, cut short, or that declares entities
-    other than TORCS's two standard lists; those two are dropped, and nothing else is opened.
+    Raises TrackError for a file that is too large, not XML, incomplete, or that declares entities
+    other than TORCS's two standard lists. Those two are removed; no other file is opened.
     """
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise TrackError(f"{path}: {size} bytes; a TORCS track file has at most {MAX_BYTES}")
     text = _REFERENCE.sub("", _DECLARATION.sub("", _decode(path.read_bytes(), path)))
-    # The DOCTYPE stays (it may name a DTD, which expat never opens); entities are refused.
+    # A DOCTYPE is allowed, since expat never opens the DTD that it names; entities are refused.
     parser = DefusedXMLParser(forbid_dtd=False, forbid_entities=True, forbid_external=True)
     try:
         parser.feed(text)

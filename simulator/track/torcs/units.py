@@ -1,8 +1,8 @@
 """Units of TORCS parameter files, by the rules of TORCS 1.3.7: names, factors and their products.
 
-A unit is a product of names: "." multiplies, "/" divides by all that follows, and "2" squares the
-name before it, as in "kg.m/s2". TORCS reads an unknown name, such as "yard" or "Deg", as 1; here it
-is refused.
+A unit is a product of names: "." multiplies, "/" divides by everything after it, and "2" squares
+the name before it, as in "kg.m/s2". TORCS reads an unknown name, such as "yard" or "Deg", as 1;
+here it raises an error.
 """
 
 import math
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 Dimension = tuple[int, int, int]
-"""Powers of metre, kilogram and second; an angle and a percentage have none."""
+"""Powers of metre, kilogram and second; all are 0 for an angle and a percentage."""
 
 RATIO: Final = (0, 0, 0)
 LENGTH: Final = (1, 0, 0)
@@ -22,7 +22,7 @@ _POUND: Final = 0.45359237
 
 @dataclass(frozen=True)
 class Unit:
-    """What one unit is in SI units."""
+    """Factor that converts a unit to SI units, and the unit's dimension."""
 
     factor: float
     dimension: Dimension = RATIO
@@ -37,7 +37,7 @@ UNITS: Final = {
     **_named("km", factor=1000.0, dimension=LENGTH),
     **_named("cm", factor=0.01, dimension=LENGTH),
     **_named("mm", factor=0.001, dimension=LENGTH),
-    # TORCS's own factors; by definition a foot is 0.3048 m, a slug 14.593903 kg, a psi 6894.757 Pa.
+    # These are TORCS's factors; exact: foot 0.3048 m, slug 14.593903 kg, psi 6894.757 Pa.
     **_named("ft", "feet", factor=0.304801, dimension=LENGTH),
     **_named("in", "inch", "inches", factor=0.0254, dimension=LENGTH),
     **_named("rad"),
@@ -59,13 +59,13 @@ UNITS: Final = {
     **_named("mph", "MPH", factor=0.44704, dimension=(1, 0, -1)),
 }
 ANY: Final = ("", "none", "SI")
-"""Units that leave the number as it is, in SI units."""
+"""Units of a number that is used unchanged, in SI units."""
 
 _PART: Final = re.compile(r"([^./2]*)([./2]|$)")
 
 
 def parse_unit(text: str) -> Unit | None:
-    """The unit that `text` names, None for ANY. Raises KeyError with an unknown name."""
+    """Return the unit that `text` names, None for ANY. Raises KeyError with an unknown name."""
     text = text.strip()
     if text in ANY:
         return None
