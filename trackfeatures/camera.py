@@ -42,11 +42,11 @@ class CameraParameters:
     y: float = 0.0
     z: float = 0.95
     pitch_deg: float = 0.0
-    """Positive: the camera looks down."""
+    """Pitch, deg; positive: the camera looks down."""
     roll_deg: float = 0.0
-    """Positive: the right side is lowered."""
+    """Roll, deg; positive: the right side is lowered."""
     yaw_deg: float = 0.0
-    """Positive: the camera is turned to the left."""
+    """Yaw, deg; positive: the camera is turned to the left."""
     matrix: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy in px. None: square pixels, `fov_y_deg`, principal point in the centre."""
     distortion: str = "none"
@@ -57,7 +57,7 @@ class CameraParameters:
     """Standard deviation of the height above the road, as a fraction of that height."""
 
     cg_height_m: ClassVar[float] = 0.25
-    """Height of the car's centre of gravity above the road."""
+    """Height of the car's centre of gravity above the road, m."""
 
     def __post_init__(self) -> None:
         if self.matrix is not None:

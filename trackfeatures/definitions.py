@@ -27,11 +27,11 @@ LANE_WIDTH_M: Final = 4.0
 LANE_WIDTH_LIMITS_M: Final = (2.7, 4.5)
 
 IN_LANE_MARGIN_M: Final = 0.5
-"""The in-lane system is active if the car is at least this far from both markings of its lane."""
+"""The in-lane system is active if the car is at least this far from both of its lane's markings."""
 ON_MARKING_REACH_M: Final = 1.2
 """The on-marking system is active within this distance of a marking."""
 OUTSIDE_REACH_M: Final = 2.0
-"""Limit of the on-marking system on the outer side of an outermost marking."""
+"""Reach of the on-marking system on the outer side of an outermost marking."""
 
 BEND_CURVATURE: Final = 1.0 / 170.0
 """Smallest curvature of a bend in 1/m; a road of lower curvature counts as straight."""

@@ -157,6 +157,7 @@ def angle_limit(kind: str, coefficients: tuple[float, ...]) -> float:
 
 
 def _positive_roots(polynomial: NDArray[np.floating[Any]]) -> list[float]:
+    """Return the positive real roots of `polynomial` (highest power first)."""
     found = np.roots(polynomial)
     real = found[np.abs(found.imag) < 1e-9 * np.maximum(1, np.abs(found))].real
     return [float(root) for root in real if root > 0]

@@ -138,6 +138,7 @@ def render_shot(
 
 
 def _write_legend(picture: Picture, kind: str) -> None:
+    """Write the colours' meaning into a depth or class picture."""
     if kind == DEPTH:
         _write(picture, f"red {NEAREST_M:.0f} m ... blue {FARTHEST_M:.0f} m", (8, 18), _WHITE)
     x = 8
@@ -183,6 +184,7 @@ def standing_pose(
 
 
 def _shots(road: Road, light: str | None, rng: np.random.Generator) -> list[Shot]:
+    """Return DRIVER_VIEWS driver views, a chase view and a top view at points round the road."""
     length = road.track.length_m
     places = (np.arange(DRIVER_VIEWS + 2) + rng.uniform(0.0, 1.0)) * length / (DRIVER_VIEWS + 2)
     reach = road.lanes * road.lane_width / 2 - 1.0
@@ -221,6 +223,7 @@ def colourise(picture: NDArray[np.generic], kind: str) -> Picture:
 
 
 def _depth_colours(depth: FloatArray) -> Picture:
+    """Return depths (H, W) in m as colours (H, W, 3), red near, blue far, sky black."""
     share = np.log(np.clip(depth, NEAREST_M, FARTHEST_M) / NEAREST_M)
     level = np.rint(255.0 * (1.0 - share / np.log(FARTHEST_M / NEAREST_M))).astype(np.uint8)
     colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)

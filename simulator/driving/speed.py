@@ -97,6 +97,7 @@ class Pedals:
         return min(throttle, MAX_THROTTLE), 0.0, gear
 
     def _choose_gear(self, speed: float) -> int:
+        """Return the gear for `speed` (m/s), changed by at most one from the last call's gear."""
         if self._rpm(speed, self._gear) > SHIFT_UP_RPM and self._gear < TOP_GEAR:
             self._gear += 1
         elif self._rpm(speed, self._gear) < SHIFT_DOWN_RPM and self._gear > 1:

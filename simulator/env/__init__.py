@@ -151,6 +151,7 @@ class LateralControl(gym.Env[Any, Any]):
         )
 
     def _observe(self) -> tuple[Observation, dict[str, Any]]:
+        """Return the observation and the info of the current state."""
         cars, state = self._cars, self.world.state
         observation = self._observer.observe(self.world, cars.states[0].copy())
         return observation, {

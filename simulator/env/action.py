@@ -97,6 +97,7 @@ def naming_car(number: int, count: int) -> Iterator[None]:
 
 
 def _numbers(what: str, given: Any) -> FloatArray:
+    """Return `given` as a float64 array. Raises UserError, which contains `what`, if it is none."""
     try:
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError) as error:  # torch raises RuntimeError
@@ -104,6 +105,7 @@ def _numbers(what: str, given: Any) -> FloatArray:
 
 
 def _clip(name: str, value: float, low: float, high: float) -> float:
+    """Clip a value that exceeds its bound by float32 rounding. Raises UserError for others."""
     clipped = clip_rounding(value, low, high)
     if not low <= clipped <= high:
         raise UserError(

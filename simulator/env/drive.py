@@ -28,6 +28,7 @@ class RoadShop:
         self._roads: dict[tuple[Any, ...], Road] = {}
 
     def road(self, options: DriveOptions, track: str, lanes: int, width: float | None) -> Road:
+        """Return the road of `width` m with `lanes` lanes on `track`, built at its first use."""
         place = (track, options.tracks_dir)
         if place not in self._tracks:
             folder = None if options.tracks_dir is None else Path(options.tracks_dir)
@@ -81,6 +82,7 @@ class Drive:
         return start
 
     def _make_world(self, rng: np.random.Generator | None) -> World:
+        """Build the world with a road and car from `rng`; None gives the least values."""
         options = self._options
         road, car = self._make_road(rng), options.car(rng)
         return World(
@@ -93,6 +95,7 @@ class Drive:
         )
 
     def _make_road(self, rng: np.random.Generator | None) -> Road:
+        """Build the road of an episode, random by `rng`; None gives the first one."""
         options, track, lanes = self._options, self._options.track, self._options.lanes
         if track == RANDOM:
             track = random_name(0 if rng is None else int(rng.integers(RANDOM_ROADS)))

@@ -1,4 +1,4 @@
-"""Observations of all cars of a vector environment."""
+"""Builds the observations of all cars of a vector environment."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -117,6 +117,7 @@ class Link:
         self.close()
 
     def _request(self) -> Message:
+        """Send the command and return its answer. Raises Refused if the server refuses it."""
         self._send_and_wait()
         record = self._inbox.record
         if record["error"]:

@@ -128,6 +128,7 @@ class LinkServer:
         return False
 
     def _handle(self, request: Any) -> None:
+        """Answer one request; accept its client if it is new, release the client if it leaves."""
         if int(request["session"]) != self._session:
             self._accept_client(request)
         self._last_command_s = time.monotonic()
@@ -151,6 +152,7 @@ class LinkServer:
         self._outbox.send()
 
     def _accept_client(self, request: Any) -> None:
+        """Begin the session of a new client; a client that had a session counts as lost."""
         if self._session:
             self._drop_client()
         self._session, self._pid = int(request["session"]), int(request["client_pid"])
@@ -165,6 +167,7 @@ class LinkServer:
         self._done = self._once or request is Request.QUIT
 
     def _check_client(self) -> None:
+        """Drop the client if it has died. Raises ClientLost if it was silent for too long."""
         if not self._segment.peer_is_alive():
             self._drop_client()
         elif 0.0 < self._patience_s < time.monotonic() - self._last_command_s:
@@ -174,6 +177,7 @@ class LinkServer:
             )
 
     def _drop_client(self) -> None:
+        """End the session of a client that has died. Raises ClientLost with `once`."""
         message = f"client {self._pid} has died {self._simulation.position_text}"
         self._session = 0
         self._lost += 1

@@ -96,6 +96,7 @@ class Simulation:
             self._measure(state, stepped=True)
 
     def _reset(self, request: Any) -> None:
+        """Start an episode, or refuse a bad start."""
         episode = self.episodes + 1
         seed, s = int(request["seed"]), float(request["start_s"])
         chosen = seed if seed >= 0 else self._seed + episode
@@ -117,6 +118,7 @@ class Simulation:
         self._measure(state, stepped=False)
 
     def _step(self, command: Command) -> None:
+        """Advance the world by one step with `command`, or refuse the command."""
         if not self._open:
             self._refuse(Refusal.NO_EPISODE, self._why_closed)
         elif self._record["ended"]:

@@ -77,6 +77,7 @@ def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:
 
 
 def _folders(tracks_dir: Path | None) -> Iterator[Path]:
+    """Yield the search folders in order. Raises UserError if `tracks_dir` does not exist."""
     yield OWN_TRACKS
     if tracks_dir is not None:
         if not tracks_dir.is_dir():

@@ -93,6 +93,7 @@ def _read_points(path: Path) -> tuple[FloatArray, float]:
 
 
 def _read_rows(path: Path) -> FloatArray:
+    """Read the rows (N, 4) of the CSV file. Raises TrackError for a line of another format."""
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise TrackError(f"{path}: {size} bytes; a centre-line file has at most {MAX_BYTES}")

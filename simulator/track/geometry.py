@@ -193,6 +193,7 @@ class Track:
         return float(rise / 2.0 / self.length[i])
 
     def _pieces_at(self, s: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """Return the piece index and the distance (m) from the piece's start of each `s` (m)."""
         wrapped = np.mod(s, self.length_m)
         # np.mod of a tiny negative number may round up to the modulus itself.
         wrapped = np.where(wrapped >= self.length_m, 0.0, wrapped)

@@ -86,6 +86,7 @@ def _even(length: float, k: float, banking: float, number: int) -> list[Row]:
 
 
 def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
+    """Return the steps of a bend's entry spiral; `sign` is 1 for a left bend, else -1."""
     count = math.ceil(bend.spiral / SPIRAL_STEP_M - 1e-9)
     # With the curvature at the middle of each step, the sum of the turns is the clothoid's.
     return [

@@ -55,6 +55,7 @@ class Table:
     where: str
 
     def number(self, key: str, lo: float, hi: float, default: float | None = None) -> float:
+        """Return the number `key`. Raises TrackError unless it is within `lo` to `hi`."""
         value = self.values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not lo <= value <= hi:
             raise TrackError(
@@ -63,6 +64,7 @@ class Table:
         return float(value)
 
     def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
+        """Return the text `key`. Raises TrackError unless it is one of `choices`."""
         value = self.values.get(key, default)
         if value not in choices:
             raise TrackError(f"{self.where}: {key} is {value!r}, expected one of {choices}")
@@ -155,6 +157,7 @@ def read_segments(table: Table) -> list[Segment]:
 
 
 def _bend(entry: Table, grade: float) -> Bend:
+    """Read a bend from its table. Raises TrackError if its spirals do not fit."""
     entry.only("type", "radius", "angle", "spiral", "banking", "grade")
     radius = entry.number("radius", 8.0, 10_000.0)
     angle = math.radians(entry.number("angle", -360.0, 360.0))
@@ -171,6 +174,7 @@ def _bend(entry: Table, grade: float) -> Bend:
 
 
 def _load(path: Path) -> Mapping[str, Any]:
+    """Read a TOML file. Raises TrackError if it is too large or unreadable."""
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise TrackError(f"{path}: {size} bytes; a track file has at most {MAX_BYTES}")
@@ -182,6 +186,7 @@ def _load(path: Path) -> Mapping[str, Any]:
 
 
 def _markings(table: Table) -> MarkingStyle:
+    """Read the style of the markings from the table [markings]."""
     if not isinstance(table.values, Mapping):
         raise TrackError(f"{table.where}: expected a table")
     table.only(*(field.name for field in fields(MarkingStyle)))

@@ -159,6 +159,7 @@ class Traffic:
         return bool(safe)
 
     def _update_ego(self, s: float, to_middle: float, speed: float) -> None:
+        """Write the ego car's extent and speed into the last row of the bodies."""
         half = 0.5 * EGO_CAR_SIZE[1]
         # The desired speed of the ego car is unknown; its current speed is used instead.
         self._bodies[self.count] = (
@@ -177,6 +178,7 @@ class Traffic:
         car_table.update_poses(self._cars, self._table, self._poses)
 
     def _initial_cars(self, count: int, rng: np.random.Generator, ego_s: float) -> FloatArray:
+        """Return a table of `count` random cars. Raises UserError if there is no room."""
         nearest = MIN_START_GAP_M + 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0])
         room = self._length - 2 * nearest
         lanes = len(self._lane_y)

@@ -55,6 +55,7 @@ def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
 
 
 def _value(value: Any, drawn: Values, scale: float, rng: np.random.Generator) -> Any:
+    """Return a random value of one entry, written in the notation of ranges.toml."""
     match value:
         case [float(least), float(most)]:
             return rng.uniform(least, most)

@@ -32,49 +32,49 @@ class CarParameters:
     """
 
     mass: float = 1150.0
-    """kg, without fuel."""
+    """Mass without fuel, kg."""
     fuel: float = 80.0
-    """kg; constant, at the centre of gravity."""
+    """Mass of the fuel, kg; constant, at the centre of gravity."""
     inertia: tuple[float, float, float] = (477.0, 868.0, 1113.0)
-    """kg m2 about x (roll), y (pitch) and z (yaw): those of a box of the car's size, with TORCS's
-    mass repartition coefficient of 0.62 on its length."""
+    """Moments of inertia about x (roll), y (pitch) and z (yaw), kg m2: those of a box of the car's
+    size, with TORCS's mass repartition coefficient of 0.62 on its length."""
     front_axle: float = 1.27
-    """m from the centre of gravity to the front axle, lf."""
+    """Distance from the centre of gravity to the front axle, lf, m."""
     rear_axle: float = 1.37
-    """m from the centre of gravity to the rear axle, lr."""
+    """Distance from the centre of gravity to the rear axle, lr, m."""
     front_track: float = 1.68
     rear_track: float = 1.60
     cg_height: float = CameraParameters.cg_height_m
-    """m above the road, at rest."""
+    """Height of the centre of gravity above the road at rest, m."""
     length: float = 4.52
     width: float = 1.94
     height: float = 1.10
 
     spring_front: float = 150_000.0
-    """N/m at the wheel."""
+    """Spring stiffness at a front wheel, N/m."""
     spring_rear: float = 150_000.0
     damper_front: float = 7_000.0
-    """N s/m at the wheel."""
+    """Damper constant at a front wheel, N s/m."""
     damper_rear: float = 7_000.0
     anti_roll_front: float = 20_000.0
-    """N/m of difference in compression between the two wheels of the axle."""
+    """Force per difference in compression between the two front wheels, N/m."""
     anti_roll_rear: float = 10_000.0
     bump_travel: float = 0.08
-    """m of compression beyond rest at which the bump stop acts."""
+    """Compression beyond rest at which the bump stop begins to act, m."""
     bump_spring: float = 600_000.0
-    """N/m of the bump stop, added to that of the spring."""
+    """Stiffness of the bump stop, added to that of the spring, N/m."""
 
     wheel_radius: float = 0.3273
     wheel_inertia: float = 1.2
-    """kg m2 of one wheel."""
+    """Moment of inertia of one wheel, kg m2."""
     friction: float = 1.6
-    """Friction coefficient (largest tyre force / load) at `working_load`, on grip 1."""
+    """Ratio of largest tyre force to load, at `working_load`, on a surface with grip 1."""
     tyre_stiffness: float = 20.0
-    """1/rad: slope of the tyre force at zero slip, divided by the largest force (Pacejka's B C)."""
+    """Slope of the tyre force at zero slip divided by the largest force, 1/rad (Pacejka's B C)."""
     tyre_shape: float = 1.41
-    """C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
+    """Factor C of the magic formula (Pacejka, Tyre and Vehicle Dynamics, 4.3.1)."""
     tyre_curvature: float = 0.7
-    """E of the magic formula."""
+    """Factor E of the magic formula."""
     camber_gain_front: float = 1.048
     """Factor of the front wheels' camber (4 deg) on the friction: 1 + 0.05 sin(18 camber)."""
     camber_gain_rear: float = 1.040
@@ -82,8 +82,7 @@ class CarParameters:
     working_load: float = 1.2
     """Ratio of the load with nominal friction to the static load without fuel."""
     friction_unloaded: float = 1.6
-    """Ratio of friction at zero load to nominal friction; friction falls exponentially with
-    load."""
+    """Ratio of friction at zero load to nominal friction; it falls exponentially with the load."""
     friction_overloaded: float = 0.8
     """Ratio of friction at infinite load to nominal friction."""
     rolling_resistance: float = 0.001
@@ -98,9 +97,9 @@ class CarParameters:
     drag_coefficient: float = 0.35
     frontal_area: float = 1.92
     wing_drag: float = 0.47
-    """m2: drag coefficient times area of the wings."""
+    """Drag coefficient times area of the wings, m2."""
     lift_front: float = 1.79
-    """m2: downforce coefficient times area at the front axle, of wing and ground effect."""
+    """Downforce coefficient times area of wing and ground effect at the front axle, m2."""
     lift_rear: float = 2.96
 
     gears: tuple[float, float, float, float, float, float] = (3.0, 1.9, 1.4, 1.1, 0.9, 0.77)
@@ -108,23 +107,23 @@ class CarParameters:
     final_drive: float = 4.5
     driveline_efficiency: float = 0.984
     engine_inertia: float = 0.02
-    """kg m2 at the crankshaft; fitted: in gear 1 the effective mass is 6.3 % larger in TORCS."""
+    """Inertia at the crankshaft, kg m2; fitted to TORCS's 6.3 % larger effective mass in gear 1."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
-    """Above this engine speed the engine gives no torque in gear, neither drive nor braking."""
+    """Engine speed above which the engine gives no torque in gear, neither drive nor braking."""
     top_rpm: float = 10_000.0
-    """End of the torque table; in gear the engine never exceeds this speed."""
+    """Engine speed at the end of the torque table; in gear the engine never exceeds it."""
     torque: tuple[float, ...] = (
         100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
     )  # fmt: skip
-    """N m at full throttle at 0, 1000, ... 10000 rev/min."""
+    """Torque at full throttle at 0, 1000, ... 10000 rev/min, N m."""
     engine_braking: float = 0.33
     """Ratio of braking torque at closed throttle to full-load torque, at `top_rpm`; 0 at idle."""
     differential_viscosity: float = 30.0
-    """N m s/rad of speed difference between the rear wheels."""
+    """Torque per speed difference of the rear wheels, N m s/rad."""
 
     brake_torque: float = 9_000.0
-    """N m at full brake, sum of the four wheels; it is enough to lock them."""
+    """Torque at full brake, sum of the four wheels, N m; it is enough to lock them."""
     brake_front_share: float = 0.58
 
     def __post_init__(self) -> None:

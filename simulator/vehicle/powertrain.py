@@ -1,4 +1,4 @@
-"""Engine, gearbox and clutch: torque (N m) from speed (rad/s) and throttle."""
+"""Engine, gearbox and clutch: computes torques (N m) from speeds (rad/s) and throttle."""
 
 from typing import Any
 

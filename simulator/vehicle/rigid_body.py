@@ -14,9 +14,8 @@ from simulator.vehicle.dynamics import DT, accelerate
 
 @inlined
 def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
-    """Return the change of the angular velocity (body frame, rad/s) in one step of Euler's
-    equations without torque: one Newton step of the implicit rule, as in PyBullet (Catto, GDC
-    2015)."""
+    """Return the change of the angular velocity (body frame, rad/s) in one torque-free step of
+    Euler's equations: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
     wx = axes[0, 0] * motion[10] + axes[0, 1] * motion[11] + axes[0, 2] * motion[12]
     wy = axes[1, 0] * motion[10] + axes[1, 1] * motion[11] + axes[1, 2] * motion[12]
     wz = axes[2, 0] * motion[10] + axes[2, 1] * motion[11] + axes[2, 2] * motion[12]

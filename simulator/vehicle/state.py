@@ -9,16 +9,16 @@ Collision = Literal["traffic", "wall"]
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """The paper's four actuator commands."""
+    """A command to the car: the paper's four actuators."""
 
     steer: float = 0.0
-    """[-1, 1], left positive; steer times the steering lock is the front-wheel angle."""
+    """Steering in [-1, 1], left positive; times the steering lock it is the front-wheel angle."""
     throttle: float = 0.0
-    """[0, 1]"""
+    """Throttle in [0, 1]."""
     brake: float = 0.0
-    """[0, 1]"""
+    """Brake in [0, 1]."""
     gear: int = 1
-    """-1 reverse, 0 neutral, 1 to 6."""
+    """Gear: -1 reverse, 0 neutral, 1 to 6."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,25 +31,25 @@ class CarState:
     z: float
     yaw: float
     pitch: float
-    """rad about the body's y axis (left): positive nose down."""
+    """Angle about the body's y axis (left), rad, positive nose down."""
     roll: float
     vx: float
-    """m/s along the body, forward positive."""
+    """Velocity along the body, m/s, forward positive."""
     vy: float
-    """m/s to the body's left."""
+    """Velocity to the body's left, m/s."""
     yaw_rate: float
     s: float
-    """m along the centre line, in [0, length)."""
+    """Distance along the centre line, m, in [0, length of the lap)."""
     to_middle: float
-    """m left of the centre line."""
+    """Lateral offset from the centre line, m, left positive."""
     angle: float
-    """rad, track tangent minus yaw, in (-pi, pi]."""
+    """Heading angle: track tangent minus yaw, rad, in (-pi, pi]."""
     curvature: float
-    """1/m of the centre line, left positive."""
+    """Curvature of the centre line at the car, 1/m, left positive."""
     rpm: float
     gear: int
     wheel_spin: tuple[float, float, float, float]
-    """rad/s: front left, front right, rear left, rear right."""
+    """Wheel speeds, rad/s: front left, front right, rear left, rear right."""
     steer: float
     """Actual front-wheel angle as a fraction of the lock; it lags behind the command."""
     lap: int

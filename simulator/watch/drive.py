@@ -118,6 +118,7 @@ class Drive:
             self._release_controls()
 
     def _handle_request(self, browser: Browser, request: BrowserRequest) -> None:
+        """Apply one request: keys, driver, pause, reset or light."""
         if request.kind == "keys" and isinstance(request.value, frozenset):
             if request.value:
                 self.driver, self._holder = "keyboard", browser
@@ -143,6 +144,7 @@ class Drive:
         self._cruise.take_over()
 
     def _show(self) -> None:
+        """Publish the state, with new pictures of the views that browsers show, every SHOW_S."""
         now = time.monotonic()
         views = [view for view in self.hub.wanted_views() if view not in self._taken]
         if now - self._last_show < SHOW_S and not (self.paused and views):

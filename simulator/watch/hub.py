@@ -30,7 +30,7 @@ class Snapshot:
 
 @dataclass(eq=False)
 class Browser:
-    """One connected page."""
+    """One connected page, and what was sent to it."""
 
     view: str
     changed: asyncio.Event = field(default_factory=asyncio.Event)

@@ -91,6 +91,7 @@ async def _send(connection: WebSocket, hub: Hub, browser: Browser) -> None:
 
 
 async def _receive(connection: WebSocket, hub: Hub, browser: Browser) -> None:
+    """Apply the browser's messages until it disconnects; the drive handles most of them."""
     while True:
         try:
             request = parse(await connection.receive_text())

@@ -25,9 +25,9 @@ class Perceived:
     """A driver's estimate of its position, drawn beside the true values."""
 
     to_middle: float | None
-    """m, left positive; None if unknown."""
+    """Lateral offset from the track's centre, m, left positive; None if unknown."""
     angle: float
-    """rad, track tangent minus yaw."""
+    """Heading angle: track tangent minus yaw, rad."""
 
     def as_dict(self) -> dict[str, float | None]:
         """Return the estimate's entries of the state message."""

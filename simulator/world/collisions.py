@@ -37,7 +37,7 @@ within it take part in the step."""
 
 
 class ContactPhysics:
-    """Contact physics of one world; `start` begins an episode."""
+    """Computes the contacts of one world with PyBullet; `start` begins an episode."""
 
     def __init__(self, road: Road, car: CarParameters, walls: Walls) -> None:
         self.walls = walls

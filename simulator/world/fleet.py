@@ -89,6 +89,7 @@ class Fleet:
         return walls
 
     def _add(self, road: Road) -> tuple[int, Road, Walls]:
+        """Add the row of `road`, its table and its walls to the arrays."""
         walls = Walls(road)
         begin, end = self._table_rows(road.track)
         row = np.zeros(ROAD_SIZE)
@@ -107,12 +108,14 @@ class Fleet:
         return self._row_of[id(road)]
 
     def _table_rows(self, track: Track) -> tuple[int, int]:
+        """Return the begin and end of the track's rows in `tables`, added if new."""
         if id(track) not in self._table_of:
             self._table_of[id(track)] = *self._tables.append(track.arrays()), track
         begin, end, _ = self._table_of[id(track)]
         return begin, end
 
     def _update(self) -> None:
+        """Rebuild `arrays`, because an append can replace an array."""
         self.arrays: Arrays = (
             self.cars,
             self.params,

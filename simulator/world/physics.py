@@ -114,6 +114,7 @@ class PhysicsClient:
         self._release()
 
     def _add_panel(self) -> int:
+        """Create a wall panel; returns its PyBullet id."""
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=[0.5 * v for v in PANEL], physicsClientId=self._client
         )
@@ -122,6 +123,7 @@ class PhysicsClient:
         )
 
     def _add_car(self, car: CarParameters) -> int:
+        """Create a car's box as a rigid body; returns its PyBullet id."""
         client = self._client
         half, above = box_height(car.height, car.cg_height)
         shape = pybullet.createCollisionShape(

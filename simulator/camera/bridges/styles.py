@@ -195,6 +195,7 @@ def adverts(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def _walkway(builder: BridgeBuilder, style: str, colour: Point) -> None:
+    """Add a deck of 2.6 m width with railings, columns and stairs, as `style`."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach = 2.6, half_span(style, wall)
     builder.box((width, 2 * reach, 0.38), (0.0, 0.0, under), colour)
@@ -269,6 +270,7 @@ def _arch_part(
     top: float,
     colour: Point,
 ) -> None:
+    """Add the part of the arch's vault and side walls between two points (y, z) of its curve."""
     for x, turn in ((-width / 2, -1), (width / 2, 1)):
         near, far = (y[0], z[0]), (y[1], z[1])
         if turn < 0:

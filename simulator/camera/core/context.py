@@ -79,6 +79,7 @@ class Graphics:
             self._fill()
 
     def _fill(self) -> None:
+        """Compile the programs, and create the shared textures, buffers and targets."""
         self.renderer = str(self.context.info["GL_RENDERER"])
         """Name of the OpenGL renderer, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
         self.programs = {name: self._program(name) for name in PROGRAMS}
@@ -135,6 +136,7 @@ class Graphics:
         return key
 
     def _program(self, name: str, *defines: str) -> "moderngl.Program":
+        """Compile a program with the #defines `defines`, and bind its blocks and samplers."""
         import moderngl
 
         head = "#version 330 core\n"
@@ -198,6 +200,7 @@ def graphics() -> Graphics:
 
 
 def _make(process: int) -> None:
+    """Create and store the graphics of `process`. Raises ForkedRendererError if it was forked."""
     if _begun - {process}:
         raise ForkedRendererError(FORKED)
     _begun.add(process)

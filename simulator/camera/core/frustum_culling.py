@@ -76,6 +76,7 @@ def visible_spheres(
 
 @compiled
 def _intersects(x: float, y: float, z: float, radius: float, planes: FloatArray) -> bool:
+    """Return whether a sphere at (x, y, z), relative to the eye, is inside all side planes."""
     inside = True
     for plane in planes:
         inside &= x * plane[0] + y * plane[1] + z * plane[2] > -radius

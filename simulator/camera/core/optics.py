@@ -77,6 +77,7 @@ def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
 
 
 def _eye(place: FloatArray, turn: FloatArray) -> Eye:
+    """Return the eye at `place` whose rotation from its frame (x ahead) to the world is `turn`."""
     axes = np.empty((3, 3))
     axes[0], axes[1], axes[2] = -turn[:, 1], turn[:, 2], turn[:, 0]
     return Eye(place, axes)

@@ -73,6 +73,7 @@ class Targets:
         return self._kept[key]
 
     def _make(self, width: int, height: int, labels: bool) -> Target:
+        """Create the framebuffers for colours (RGBA, 8 bit) or labels (2 x float32)."""
         import moderngl
 
         size = (width, height)

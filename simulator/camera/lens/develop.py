@@ -11,7 +11,7 @@ from runtime.jit import compiled
 
 NOISE_SIZE = 2**17
 NOISE_STEPS = 32.0
-"""Integer steps of the noise table per standard deviation."""
+"""Size of the noise table's integer unit: this many units are one standard deviation."""
 MOST_TAPS = 6
 LEAST_BLUR_PX = 0.75
 

@@ -57,6 +57,7 @@ def _toned(colour: str, paint: Paint) -> Row:
 
 
 def _paint_rows(paint: Paint) -> list[Row]:
+    """Return the rows with wear, gaps, colour, arrows and crosswalks of the paint."""
     return [
         (paint.wear, paint.missing, paint.phase, 0.0),
         (paint.gap_m, paint.gap_every_m, float(paint.gap_marking), 0.0),
@@ -71,6 +72,7 @@ def _paint_rows(paint: Paint) -> list[Row]:
 
 
 def _surface_rows(surface: Surface) -> list[Row]:
+    """Return the rows with the properties of the road's surface."""
     ratio = surface.other_tone / surface.tone if surface.tone else 0.0
     return [
         (ratio, surface.section_m, 0.0, 0.0),

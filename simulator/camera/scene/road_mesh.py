@@ -161,6 +161,7 @@ def _lapped(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _normals(mesh: RoadMesh) -> FloatArray:
+    """Return the unit normals (R, C, 3) at the vertices."""
     along = np.gradient(mesh.points, axis=0)
     left, right = mesh.points[:, 2:3], mesh.points[:, -3:-2]
     across = np.broadcast_to(left - right, mesh.points.shape).copy()

@@ -140,6 +140,7 @@ def _run_out(strip: Strip, road: Road, along_m: float, land: TreeShade) -> None:
 
 
 def _folded(strip: Strip) -> NDArray[np.uint8]:
+    """Return the texels (bands * rows, BAND_TEXELS + 2 GUARD) of the unfolded mask `strip`."""
     columns = strip.shape[1]
     bands = -(-columns // BAND_TEXELS)
     first = BAND_TEXELS * np.arange(bands)[:, None] - GUARD

@@ -38,12 +38,13 @@ class Sky:
         context.vertex_array(program, [layout]).render()
 
     def draw(self) -> None:
-        """Draw the sky where no geometry covers it."""
+        """Draw the sky in the pixels that no geometry covers."""
         self._texture.use(SKY_UNIT)
         self._array.render()
 
 
 def _panorama_size(focal_px: float) -> tuple[int, int]:
+    """Return width and height of the panorama in texels."""
     wanted = 2.0 * math.pi * focal_px * _SHARPNESS
     width = int(np.clip(2 ** math.ceil(math.log2(wanted)), *_WIDTHS))
     return width, width // 4

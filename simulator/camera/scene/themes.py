@@ -37,7 +37,7 @@ class Theme:
     posts: bool = False
     lamps: bool = False
     poles: bool = False
-    """Telegraph poles along one side."""
+    """Whether telegraph poles stand along one side of the road."""
     blocks: float = 0.0
     """Density of apartment blocks with flat roofs."""
     grassy: float = 0.35

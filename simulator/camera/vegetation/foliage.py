@@ -91,6 +91,7 @@ def _disc(canvas: Canvas, x: float, y: float, radius: float, colour: FloatArray)
 
 
 def _trunk(canvas: Canvas, top: float, width: float, bark: FloatArray = _BARK) -> None:
+    """Draw a trunk up to the height `top`; `width` is half its width at the foot (cell shares)."""
     size = canvas.shape[0]
     for k in range(24):
         share = k / 23

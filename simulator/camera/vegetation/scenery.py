@@ -91,6 +91,7 @@ kind), and the distance (m) that the crown may reach over the asphalt."""
 
 
 def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
+    """Return random trees in groves on both sides of the road, denser near it."""
     length = road.track.length_m
     density = theme.tree_density * rng.uniform(0.6, 1.3)
     count = int(density * length / 100.0 * 2.0)

@@ -122,6 +122,7 @@ class PicturePool:
         self._workers, self._pictures = [], {}
 
     def _start(self) -> None:
+        """Create the shared memory and start the workers, unless they run already."""
         if self.running:
             return
         self.close()  # in a forked child, forgets the workers of the parent
@@ -137,6 +138,7 @@ class PicturePool:
             os.close(descriptor)
 
     def _start_worker(self, number: int, cars: range, descriptor: int) -> _Worker:
+        """Start one worker, which inherits the shared memory, and send it its setup."""
         mine, theirs = socket.socketpair()
         # A stopped worker reads nothing, so sending must have a time limit.
         mine.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", SILENCE_S, 0))
@@ -161,6 +163,7 @@ class PicturePool:
         return worker
 
     def _send(self, worker: _Worker, shots: list[Shot], views: tuple[str, ...]) -> None:
+        """Send a worker its shots, and the sceneries that it has not received yet."""
         new = {shot.scenery for shot in shots} - worker.sceneries
         task = Task(shots, views, {number: self._sceneries[number] for number in new})
         self._put(worker, task)
@@ -168,6 +171,7 @@ class PicturePool:
         worker.due, worker.heard = {shot.car for shot in shots}, monotonic()
 
     def _put(self, worker: _Worker, message: Setup | Task) -> None:
+        """Send a message to a worker. Raises PictureWorkerError if it has ended or hangs."""
         try:
             worker.connection.send(message)
         except BlockingIOError:

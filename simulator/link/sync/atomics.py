@@ -24,6 +24,8 @@ def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any
 
 
 def _load(ordering: str) -> Intrinsic:
+    """Return a function (array, index) for compiled code that loads an item with this ordering."""
+
     def typed(typing_context: Any, array: Any, index: Any) -> Any:
         def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             place = _place(context, builder, signature.args[0], *arguments)
@@ -36,6 +38,8 @@ def _load(ordering: str) -> Intrinsic:
 
 
 def _store(ordering: str) -> Intrinsic:
+    """Return a function (array, index, value) that stores an item with this ordering."""
+
     def typed(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
         def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             place = _place(context, builder, signature.args[0], arguments[0], arguments[1])
@@ -48,6 +52,8 @@ def _store(ordering: str) -> Intrinsic:
 
 
 def _fence(ordering: str) -> Intrinsic:
+    """Return a function for compiled code that is a memory fence with this ordering."""
+
     def typed(typing_context: Any) -> Any:
         def build(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
             builder.fence(ordering)

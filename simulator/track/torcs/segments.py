@@ -47,6 +47,7 @@ def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piec
 def _segment_pieces(
     segment: Section, profile: Profile, width: float, global_step: float
 ) -> Iterator[Piece]:
+    """Yield the pieces of one segment, and store its end in `profile`."""
     sign, radius, radius_end, length = _plan(segment)
     start, end = _end_heights(segment, profile, width, length)
     spline = (segment.text("profil") or "spline") == "spline"
@@ -131,12 +132,14 @@ def _mean(edges: Edges) -> float:
 
 
 def _banked(middle: float, edges: Edges, banking: float | None, width: float) -> Edges:
+    """Return both edges' heights (m) from the middle's height and the banking (rad)."""
     # Without a banking angle of its own, a segment keeps the height difference of its edges.
     half = (edges[0] - edges[1]) / 2.0 if banking is None else math.tan(banking) * width / 2.0
     return np.array([middle + half, middle - half])
 
 
 def _step_count(segment: Section, length: float, global_step: float) -> int:
+    """Return the number of profile steps. Raises TrackError if it is out of range."""
     steps = int(_or(segment.number("profil steps"), 1.0))
     if steps == 1:
         step_length = _or(segment.length("profil steps length"), global_step)

@@ -60,6 +60,7 @@ class Section:
         return self._number(name, RATIO, "an angle, a ratio or a plain number")
 
     def _number(self, name: str, dimension: Dimension, expected: str) -> float | None:
+        """Return an `attnum` in SI units, None if absent. Raises TrackError for another unit."""
         attribute = self._attribute("attnum", name)
         if attribute is None:
             return None
@@ -133,6 +134,7 @@ def read_parameter_file(path: Path) -> Section:
 
 
 def _decode(data: bytes, path: Path) -> str:
+    """Decode a file's bytes with the encoding that it declares, by default UTF-8."""
     encoding = "utf-8-sig"
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
