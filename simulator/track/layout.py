@@ -68,7 +68,7 @@ def cut(segments: list[Segment]) -> Steps:
         rows += ramp
         if arc > 0.0:
             rows += _even(arc, k, -sign * segment.banking, number)
-        # The exit spiral is the entry spiral reversed, so each step ends with its former start.
+        # The exit spiral is the entry spiral reversed, so the start banking of a step is its end.
         starts = [0.0] + [banking for _, _, banking, _ in ramp[:-1]]
         rows += [
             (length, curvature, start, number)

@@ -120,7 +120,7 @@ def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, flo
         if squared < best_squared:
             best, best_s, best_d, best_squared = index, along, d, squared
     # In the wedge outside a kink of the centre line (the closing joint of a TORCS track) no
-    # perpendicular foot exists; the offset from the extended piece is then as near as any.
+    # perpendicular foot exists; there the offset from the extended piece is an approximation.
     return best, wrap(table, table[best, S0] + best_s), best_d
 
 

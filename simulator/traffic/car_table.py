@@ -27,7 +27,7 @@ MIN_CHANGE_LENGTH_M = 25.0
 CHANGE_COOLDOWN_S = 3.0
 SAFE_BRAKING = COMFORTABLE_BRAKING  # m/s2: largest braking that a lane change may cause
 MIN_GAIN = 0.2  # m/s2: least gain in acceleration for a lane change
-MIN_LENGTH_RATIO = 0.05  # lane length over centre-line length, near the centre of a bend
+MIN_LENGTH_RATIO = 0.05  # least ratio of lane length to centre-line length in a bend
 POLITENESS = 0.2  # MOBIL: weight of the new follower's loss
 
 
@@ -168,7 +168,7 @@ def decide_lane_change(
     spacing = abs(lane_y[0] - lane_y[1])
     for target in lane_y:
         if abs(abs(target - y) - spacing) > 0.01:
-            continue  # not the lane beside this one
+            continue  # `target` is not a lane beside this one
         right, left = target - half_width, target + half_width
         safe, loss = lane_change_safe(bodies, i, s, speed, right, left, half_length, length)
         if not safe:

@@ -59,7 +59,7 @@ def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
     pose = np.asarray(body_pose, dtype=np.float64)
     yaw = float(pose[5])
     if view == "chase":
-        # Behind the car, without roll.
+        # This view is behind the car and has no roll.
         turn = rotation(0.0, math.radians(_CHASE_PITCH_DEG), yaw)
         back = rotation(0.0, float(pose[4]), yaw) @ np.array([-_CHASE_BACK_M, 0.0, 0.0])
         return _eye(pose[:3] + back + np.array([0.0, 0.0, _CHASE_UP_M]), turn)

@@ -131,7 +131,7 @@ def _run_out(strip: Strip, road: Road, along_m: float, land: TreeShade) -> None:
     for side, rim in ((1.0, y > 0), (-1.0, y < 0)):
         pose = road.track.at(s, side * (road.wall_offset + end))
         shade = land.at(pose.x, pose.y)
-        # The value that road.frag.glsl's smoothstep(0.3, 0.7) turns into `shade`.
+        # `level` is the value that road.frag.glsl's smoothstep(0.3, 0.7) turns into `shade`.
         level = 0.3 + 0.4 * (0.5 - np.sin(np.arcsin(1.0 - 2.0 * shade) / 3.0))
         part = np.flatnonzero(rim & (share > 0.0))
         weight = share[part, None]

@@ -28,7 +28,7 @@ def box(
     """
     rows = _unit_box()[: 36 if floor else 30].copy()
     rows[:, :3] = rows[:, :3] * size + at
-    # Extent (u, v) of the faces: y by z for the first two sides, x by z for the next, x by y flat.
+    # Extents (u, v): (y, z) of the sides +x and -x, (x, z) of +y and -y, (x, y) of top and floor.
     x, y, z = size
     rows[:12, 9:11] *= (y, z)
     rows[12:24, 9:11] *= (x, z)
