@@ -24,11 +24,12 @@ OFFSET, SPAN = 0.1, 0.8
 UNKNOWN_M: Final = math.inf
 """Value of an unlabelled distance; the loss and the metrics ignore it."""
 IN_LANE_WIDTH_LIMIT_M = 5.5
-"""Decoding: `ml` and `mr` are present if `mr - ml` is below this limit."""
+"""When values are decoded, `ml` and `mr` are present if `mr - ml` is below this limit."""
 ON_MARKING_LIMIT_M = 2.75
-"""Decoding: `m` is present if its value is below this limit."""
+"""When values are decoded, `m` is present if its value is below this limit."""
 NEIGHBOUR_LIMIT_M = 6.75
-"""Decoding: `l` and `r` are present if `m` is present and their magnitude is below this limit."""
+"""When values are decoded, `l` and `r` are present if `m` is and their magnitude is below this
+limit."""
 
 _LO = np.array([RANGES[name].lo for name in TARGETS])
 _WIDTH = np.array([RANGES[name].hi - RANGES[name].lo for name in TARGETS])

@@ -80,8 +80,8 @@ class TrackFeatures:
     """The track features of one image or one moment."""
 
     ml: float | None
-    """Distance to the marking in m, negative left of the car; None if it is absent. The next four
-    fields are distances of the same kind."""
+    """Distance to the marking `ml` in m, negative left of the car; None if it is absent. The next
+    four fields are distances of the same kind."""
     mr: float | None
     l: float | None
     m: float | None

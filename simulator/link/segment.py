@@ -56,7 +56,7 @@ class Segment:
         return np.frombuffer(self.memory, dtype=np.uint8)
 
     def peer_is_alive(self) -> bool:
-        """Return whether a process has the other role."""
+        """Return whether a process holds the other role, that is, whether the peer is alive."""
         return is_locked(self.descriptor, Role(1 - self.role))
 
     def publish(self) -> None:

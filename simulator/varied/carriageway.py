@@ -15,8 +15,8 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.definitions import LANE_WIDTH_LIMITS_M
 
 APPARENT_WIDTH_M = (2.75, 4.4)
-"""Least and greatest apparent width of a lane in the model's pictures. A camera at another height
-shows the road scaled by the ratio of the heights."""
+"""Least and greatest apparent width (m) of a lane in the model's pictures. A camera at another
+height shows the road scaled by the ratio of the heights."""
 MODEL_HEIGHT_M = CameraParameters().height_above_road_m
 CAMERA_HEIGHT_M = (0.9, 2.2)
 

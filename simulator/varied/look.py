@@ -47,7 +47,7 @@ class Surface:
     halves: float = 0.0
     """Difference in tone between the two sides of a lengthwise seam, as a share."""
     seam_m: float = 0.0
-    """Lateral position of that seam, m left of the road's centre."""
+    """Lateral position of the seam, m left of the road's centre."""
     tar: float = 0.0
     """Share of the seams and cracks that are filled with tar, 0 to 1."""
     patches: float = 0.0

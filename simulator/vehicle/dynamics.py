@@ -1,7 +1,8 @@
 """Forces of wheels, air and gravity on the car's body, in one compiled step of 1/200 s.
 
-World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units.
-This module computes force and torque; `rigid_body` or PyBullet moves the body.
+World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units. `p`
+is the record `CarParameters.packed()[0]`. This module computes force and torque; `rigid_body` or
+PyBullet moves the body.
 """
 
 import math

@@ -1,4 +1,5 @@
-"""Engine, gearbox and clutch: computes torques (N m) from speeds (rad/s) and throttle."""
+"""Engine, gearbox and clutch: computes torques (N m) from speeds (rad/s) and throttle. `p` is the
+record `CarParameters.packed()[0]`."""
 
 from typing import Any
 

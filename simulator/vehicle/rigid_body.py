@@ -1,7 +1,8 @@
 """Rigid-body motion of a free car, one compiled physics step at a time.
 
 The integration scheme is PyBullet's (semi-implicit Euler, exact rotation), so that the result is
-the same whether PyBullet or this code moves the body. World frame, SI units.
+the same whether PyBullet or this code moves the body. World frame, SI units. `p` is the record
+`CarParameters.packed()[0]`.
 """
 
 import math

@@ -1,6 +1,7 @@
 """Tyre force from slip and load, with the friction ellipse. Wheel frame: x forward, y left.
 
-The magic formula and the effect of the load are those of TORCS's car model.
+The magic formula and the effect of the load are those of TORCS's car model. `p` is the record
+`CarParameters.packed()[0]`.
 """
 
 import math

@@ -1,6 +1,7 @@
 """Contact of the four wheels with the road: geometry, suspension loads and tyre forces.
 
-World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units.
+World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units. `p`
+is the record `CarParameters.packed()[0]`.
 """
 
 import math

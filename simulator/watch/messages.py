@@ -20,7 +20,8 @@ MAX_STATIONS: Final = 6000
 
 
 def scene_message(road: Road, *, controls: bool) -> str:
-    """Return the constant data of one road; `controls`: whether a browser may drive and pause."""
+    """Return the constant data of one road as JSON; `controls`: whether a browser may drive and
+    pause."""
     track = road.track
     count = min(math.ceil(track.length_m / STATION_M), MAX_STATIONS)
     pose = track.at(np.arange(count) * track.length_m / count)
@@ -47,7 +48,7 @@ def scene_message(road: Road, *, controls: bool) -> str:
 
 
 def state_message(world: World, **about: Any) -> str:
-    """Return the car and its surroundings; `about` adds the drive's values (score, rate, ...)."""
+    """Return the state of car and surroundings as JSON; `about` adds values such as the score."""
     now = world.state
     features = world.features()
     state = {

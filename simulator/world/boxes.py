@@ -1,7 +1,7 @@
 """Boxes around cars and in walls, and a test whether two of them overlap, in compiled code.
 
 A box is an array (BOX,): centre (m), its three axes as rows of unit vectors, half extents along the
-axes (m). World frame, z up.
+axes (m). World frame, z up. `p` is the record `CarParameters.packed()[0]`.
 """
 
 import math

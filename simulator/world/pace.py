@@ -9,7 +9,7 @@ from trackfeatures.errors import UserError
 
 SPEEDS: Final = (0.05, 100.0)
 MAX_CATCH_UP_S: Final = 0.25
-"""Longest delay (s) of a watched drive that is caught up."""
+"""Longest delay (s) of a watched drive that later steps make up; longer delays remain."""
 WINDOW_S: Final = 1.5
 """Length of the time window (s) in which a rate is measured."""
 

@@ -77,7 +77,7 @@ def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
 
 
 def _eye(place: FloatArray, turn: FloatArray) -> Eye:
-    """Return the eye at `place` whose rotation from its frame (x ahead) to the world is `turn`."""
+    """Return an eye at `place`; `turn` (3, 3) rotates its frame (x ahead, y left) to the world."""
     axes = np.empty((3, 3))
     axes[0], axes[1], axes[2] = -turn[:, 1], turn[:, 2], turn[:, 0]
     return Eye(place, axes)
@@ -128,8 +128,8 @@ def _pixels(
 
 
 def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
-    """Return the matrix (4, 4) from world coordinates relative to the eye to clip space; multiply
-    it by column vectors.
+    """Return the matrix (4, 4) from world coordinates relative to the eye to clip space, for column
+    vectors and the intrinsics `matrix` (3, 3).
 
     The image is flipped against OpenGL's convention: the first row in memory is the top row.
     """
@@ -147,7 +147,8 @@ def clip_matrix(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatA
 
 
 def frustum(eye: Eye, matrix: FloatArray, width: int, height: int) -> FloatArray:
-    """Return the inward unit normals (4, 3) of the side planes, which pass through the eye."""
+    """Return the inward unit normals (4, 3) of the side planes through the eye, for a view of
+    `width` x `height` px with the intrinsics `matrix` (3, 3)."""
     left, up = ((matrix[k, 2] + 0.5) / matrix[k, k] for k in (0, 1))
     right, down = width / matrix[0, 0] - left, height / matrix[1, 1] - up
     sides = np.array([[-1.0, 0.0, right], [1.0, 0.0, left], [0.0, -1.0, up], [0.0, 1.0, down]])

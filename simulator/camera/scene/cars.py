@@ -165,7 +165,7 @@ def _fittings() -> list[FloatArray]:
 
 
 class Cars:
-    """The car mesh in graphics memory and its drawing; all cameras of a process share it."""
+    """Draws cars with one mesh in graphics memory, which all cameras of a process share."""
 
     def __init__(self, graphics: Graphics, *features: str) -> None:
         context = graphics.context

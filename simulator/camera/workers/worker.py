@@ -120,7 +120,7 @@ def main(connection: Connection, descriptor: int, parent: int) -> None:
 def draw(
     shot: Shot, views: tuple[str, ...], cameras: Cameras, pictures: dict[str, NDArray[Any]]
 ) -> None:
-    """Draw the views of one car into its rows of `pictures` (cars, *shape) by view."""
+    """Draw `views` of the shot's car into that car's rows of `pictures` (cars, *shape)."""
     camera = cameras.of(shot.scenery)
     drawn = camera.render_views(shot.pose, shot.others, views, near_s=shot.s)
     for view, picture in drawn.items():

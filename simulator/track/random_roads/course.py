@@ -22,8 +22,8 @@ SHARP_DEG: Final = 35.0
 """Least turn of a corner that may consist of several arcs."""
 MIN_BANKED_SPIRAL_M: Final = 8.0
 RANK_NOISE: Final = 0.6
-"""Noise on the logarithm of the largest radius that fits each corner. Corners are sorted by it, so
-that small radii mostly are in corners with little room."""
+"""Largest random change of the logarithm of the radius that fits a corner, before corners are
+sorted by it. Because of the sorting, small radii mostly are in corners with little room."""
 
 
 class DoesNotFit(Exception):

@@ -106,7 +106,7 @@ def _decimal(limits: tuple[float, float], digits: int, rng: np.random.Generator)
 
 
 def _course_rows(kind: Kind, rng: np.random.Generator) -> list[Row]:
-    """Return the rows, without grades, of a random course whose parts keep their distance."""
+    """Return the TOML rows, without grades, of a random course that keeps clear of itself."""
     unevenness = kind.unevenness
     while True:
         try:

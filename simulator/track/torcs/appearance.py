@@ -23,7 +23,7 @@ NAMED: Final = (
     ("countryside", ("ole-road", "spring")),
     ("circuit", ("forza", "wheel", "brondehach")),
 )
-"""Look for words that a track's name contains; the first match is used."""
+"""Looks, each with the words in a track's name that select it; the first match is used."""
 WITH_KERBS: Final = ("circuit", "forest", "circuit", "countryside")
 WITHOUT_KERBS: Final = ("countryside", "forest", "ring-road", "highway")
 

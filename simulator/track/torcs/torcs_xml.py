@@ -51,16 +51,16 @@ class Section:
         return next((child for child in self.sections() if child.name == name), None)
 
     def length(self, name: str) -> float | None:
-        """Return an `attnum` in m, None if absent. Raises TrackError unless it is a finite number
-        with a unit of length or without a unit."""
+        """Return the numeric attribute (`attnum`) `name` in m, None if absent. Raises TrackError
+        unless it is a finite number with a unit of length or without a unit."""
         return self._number(name, LENGTH, "a length")
 
     def number(self, name: str) -> float | None:
-        """Return an `attnum` that is an angle (rad), a slope or a plain number, like `length`."""
+        """Return the numeric attribute `name`: an angle (rad), a slope or a plain number."""
         return self._number(name, RATIO, "an angle, a ratio or a plain number")
 
     def _number(self, name: str, dimension: Dimension, expected: str) -> float | None:
-        """Return an `attnum` in SI units, None if absent. Raises TrackError for another unit."""
+        """Return the numeric attribute `name` in SI units, None if absent. Raises TrackError."""
         attribute = self._attribute("attnum", name)
         if attribute is None:
             return None

@@ -59,7 +59,7 @@ UNITS: Final = {
     **_named("mph", "MPH", factor=0.44704, dimension=(1, 0, -1)),
 }
 ANY: Final = ("", "none", "SI")
-"""Units of a number that is used unchanged, in SI units."""
+"""Texts for "no unit"; the number is used unchanged, as a value in SI units."""
 
 _PART: Final = re.compile(r"([^./2]*)([./2]|$)")
 
