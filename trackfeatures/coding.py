@@ -28,8 +28,7 @@ IN_LANE_WIDTH_LIMIT_M = 5.5
 ON_MARKING_LIMIT_M = 2.75
 """When values are decoded, `m` is present if its value is below this limit."""
 NEIGHBOUR_LIMIT_M = 6.75
-"""When values are decoded, `l` and `r` are present if `m` is and their magnitude is below this
-limit."""
+"""When values are decoded, `l` and `r` are present if `m` is and they are within this limit."""
 
 _LO = np.array([RANGES[name].lo for name in TARGETS])
 _WIDTH = np.array([RANGES[name].hi - RANGES[name].lo for name in TARGETS])

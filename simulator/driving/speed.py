@@ -48,8 +48,8 @@ def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProf
 
 
 def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
-    """Compute the profile that allows for bends and braking before them only, without a desired
-    speed. `innermost_y` (m) as in `speed_profile`."""
+    """Compute a profile that is limited only by bends and braking before them. `innermost_y` (m) as
+    in `speed_profile`."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)

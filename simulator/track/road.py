@@ -82,7 +82,7 @@ class Road:
 
     def lines_y(self, to_middle: float) -> NDArray[np.float64]:
         """Return the lateral positions (lanes + 1,) of the lines that bound lanes for a car at
-        `to_middle`. Of a double line, it is the line nearer to the car's lane."""
+        `to_middle`. Of the lines of a double line, the one nearer to the car's lane counts."""
         if not self.line_offsets:
             return self.markings_y
         lane = tf.lane_index(to_middle, self.lanes, self.lane_width)

@@ -13,7 +13,7 @@ from simulator.watch.requests import BrowserRequest
 MAX_BROWSERS = 16
 MAX_REQUESTS = 256
 MAX_UNANSWERED = 2
-"""Largest number of unanswered messages per browser; at it, states are skipped."""
+"""Largest number of unanswered messages per browser; further states are then skipped."""
 
 
 @dataclass(frozen=True)

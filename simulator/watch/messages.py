@@ -20,7 +20,7 @@ MAX_STATIONS: Final = 6000
 
 
 def scene_message(road: Road, *, controls: bool) -> str:
-    """Return the constant data of one road as JSON; `controls`: whether a browser may drive and
+    """Return the constant data of a road as JSON; `controls`: whether browsers may drive and
     pause."""
     track = road.track
     count = min(math.ceil(track.length_m / STATION_M), MAX_STATIONS)

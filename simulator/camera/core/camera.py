@@ -58,7 +58,7 @@ class _LoadedScene:
     first_paint: int
     cars: Cars
     imaging: Imaging | None
-    """None records the rendered picture unchanged."""
+    """Effects of cabin, lens and sensor; None: the rendered picture is recorded unchanged."""
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,7 @@ def _small(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Generator) -> _Drops:
-    """Return random drops: the first part, `share` (0 to 1), of drops that cover `cover` of a
-    picture."""
+    """Return the first part, `share` (0 to 1), of random drops that cover `cover` of a picture."""
     width, height = size
     scale = width / REFERENCE_WIDTH
     radius = np.clip(np.exp(rng.normal(0.7, 0.45, MOST_DROPS)), 1.1, 9.0) * scale

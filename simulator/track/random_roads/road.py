@@ -166,7 +166,7 @@ def write_road(seed: int, path: Path) -> None:
 
 
 def _lines(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a TOML file; JSON writes its strings, booleans and numbers equally."""
+    """Yield the lines of a TOML file; strings, booleans and numbers are written as in JSON."""
     for key, value in content.items():
         if not isinstance(value, dict | list):
             yield f"{key} = {json.dumps(value)}"
