@@ -22,9 +22,9 @@ from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
 from controllers.drive.many import Outcome, Task, can_join, drive_many
 from controllers.drive.run import GRID_SHARE, drive, read_parameters
 from controllers.interface import LoopConfig
-from controllers.laws.actor import WEIGHTS, is_actor
+from controllers.laws.actor import SHIPPED, WEIGHTS, is_actor
 from controllers.perception.sources import ServiceModel, check_perception
-from controllers.registry import make_controller
+from controllers.registry import CONTROLLERS, make_controller
 from runtime.files import locked_folder, write_json
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
@@ -253,7 +253,7 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
 
 def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
     """Return, for each drive, a hash of the inputs that its cell does not contain: the tuned
-    parameters, the road, the user's file or trained actor, and the weights of the model."""
+    parameters, the road, the controller's files, and the weights of the model."""
     tracks = {
         name: find_track(name, config.tracks_dir).content_hash.encode()
         for name in dict.fromkeys(cell.track for cell in todo)
@@ -261,8 +261,7 @@ def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
     parameters, files = {}, {}
     for name in dict.fromkeys(cell.controller for cell in todo):
         parameters[name] = json.dumps(parameters_of(config, name)).encode()
-        file = _file_of(name)
-        files[name] = b"" if file is None else file.read_bytes()
+        files[name] = b"".join(file.read_bytes() for file in _files_of(name))
     models = {
         name: _model_of(config, name).encode()
         for name in dict.fromkeys(cell.perception for cell in todo)
@@ -281,13 +280,21 @@ def _model_of(config: CompareConfig, perception: str) -> str:
     return model_hash(config.model) if perception == "model" else service_model_hash(perception)
 
 
-def _file_of(controller: str) -> Path | None:
-    """Path of a trained actor's weights or of the file with a user's class, else None."""
+def _files_of(controller: str) -> list[Path]:
+    """Paths of a controller's module, or of the file with a user's class, and of its weights."""
+    if controller in CONTROLLERS:
+        module = CONTROLLERS[controller].factory.partition(":")[0]
+        weights = SHIPPED / controller / WEIGHTS
+        return [_module_file(module), *filter(Path.is_file, [weights])]
     if is_actor(Path(controller)):
-        return Path(controller) / WEIGHTS
+        return [Path(controller) / WEIGHTS]
     place = controller.rpartition(":")[0]
-    file = place if place.endswith(".py") else getattr(sys.modules.get(place), "__file__", None)
-    return None if file is None else Path(file)
+    return [Path(place) if place.endswith(".py") else _module_file(place)]
+
+
+def _module_file(module: str) -> Path:
+    """Path of an imported module's file."""
+    return Path(str(sys.modules[module].__file__))
 
 
 def model_hash(run: str) -> str:

@@ -21,6 +21,8 @@ from runtime.files import atomic_write, write_json
 from trackfeatures.errors import UserError
 
 WEIGHTS, CARD = "actor.safetensors", "actor.json"
+SHIPPED = Path(__file__).parent.parent / "weights"
+"""Folder of the shipped actors, each in a folder of its name."""
 FORMAT = 1
 NAMES = ("w1", "b1", "w2", "b2", "w3", "b3")
 Array = NDArray[np.float32]

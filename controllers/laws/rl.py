@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.interface import LoopConfig, Observation, Observations
-from controllers.laws.actor import Actor, load_actor
+from controllers.laws.actor import SHIPPED, Actor, load_actor
 from controllers.laws.actor_state import EXACT, STEP_S, StateBuilder, paper_state
 from trackfeatures.errors import UserError
 
 FARTHEST_M = 1.0
 """Largest offset (m) that an actor receives on perception. At larger offsets an actor turns the car
 by 0.3 rad towards the lane, but the shipped model's angle is 0.25 rad at most."""
-SHIPPED = Path(__file__).parent.parent / "weights"
 
 
 class RlController:

@@ -110,11 +110,9 @@ class ProcessPool:
         for number, worker in enumerate(self._workers):
             if worker.job is None or now < worker.deadline(self._timeouts):
                 continue
-            silent = now - worker.last_heartbeat >= self._timeouts.heartbeat_s
             worker.process.kill()  # a suspended process does not react to SIGTERM
-            spent = now - (worker.last_heartbeat if silent else worker.started)
-            what = "its process gave no sign of life" if silent else "it was not finished"
-            self._replace(number, f"{what} for {spent:.0f} s")
+            spent = self._timeouts.spent(now, worker.started, worker.last_heartbeat)
+            self._replace(number, f"its process {spent}")
 
     def _handle(self, worker: Worker, message: Message) -> None:
         if isinstance(message, FramesDone):

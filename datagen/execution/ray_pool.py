@@ -37,6 +37,7 @@ class Recorder:
 
     def record(self, job: Job) -> tuple[Outcome, bytes]:
         """Try to record a round. Returns the outcome and the file's bytes (empty on failure)."""
+        self._frames = 0
         with tempfile.TemporaryDirectory(prefix="datagen-") as home:
             prepare(Path(home))
             ending = attempt(replace(job, folder=Path(home)), self._report)
@@ -195,9 +196,8 @@ class RayPool:
         for slot in self._slots:
             if now >= slot.deadline(self._timeouts):
                 self._ray.kill(slot.actor)
-                self._replace(
-                    slot, f"its actor gave no sign of life for {now - slot.last_heartbeat:.0f} s"
-                )
+                spent = self._timeouts.spent(now, slot.started or now, slot.last_heartbeat)
+                self._replace(slot, f"its actor {spent}")
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
         self._queue.record_death(slot.job, reason)

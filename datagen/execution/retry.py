@@ -35,6 +35,13 @@ class Timeouts:
         round_s = self.round_start_s + self.frame_s * job.plan.frames
         return min(last_heartbeat + self.heartbeat_s, started + round_s)
 
+    def spent(self, now: float, started: float, last_heartbeat: float) -> str:
+        """Return why a process that is past its deadline is stopped, in words."""
+        silent_s = now - last_heartbeat
+        if silent_s >= self.heartbeat_s:
+            return f"gave no sign of life for {silent_s:.0f} s"
+        return f"did not finish the round in {now - started:.0f} s"
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:

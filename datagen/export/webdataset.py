@@ -57,8 +57,8 @@ def _samples(side: Side, shuffle: bool) -> Iterator[tuple[RoundInfo, Step, str]]
 
 
 def _add_sample(shard: tarfile.TarFile, info: RoundInfo, step: Step, codec: str) -> None:
-    # WebDataset ends a key at the first dot.
-    key = f"{info.path.stem.replace('.', '_')}-{step.number:06d}"
+    # WebDataset ends a key at the first dot. No name of a round contains "%".
+    key = f"{info.path.stem.replace('.', '%2E')}-{step.number:06d}"
     _add(shard, f"{key}.{SUFFIX[codec]}", bytes(step.image))
     _add(shard, f"{key}.json", json.dumps(sample(info, step)).encode())
 

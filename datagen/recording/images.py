@@ -14,12 +14,14 @@ Buffer = bytes | memoryview
 
 
 def encode(image: NDArray[np.uint8], codec: str) -> bytes:
-    """Encode `image` (H, W, 3) uint8 RGB with `codec` ("jpeg" or "png"; other names give a PNG)."""
+    """Encode `image` (H, W, 3) uint8 RGB with `codec` ("jpeg" or "png")."""
     if codec == "jpeg":
         import simplejpeg
 
         contiguous = np.ascontiguousarray(image)
         return bytes(simplejpeg.encode_jpeg(contiguous, JPEG_QUALITY, "RGB", "420"))
+    if codec != "png":
+        raise ValueError(f"codec {codec!r}, not jpeg or png")
     import cv2
 
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

@@ -6,6 +6,8 @@ of the standard deviations and the limit of the out-of-distribution score.
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,6 +78,17 @@ and Taylor 1989). On test rounds 90 to 93 % of the errors were within two standa
 a normal distribution 85 to 91 % (docs/experiments/uncertainty.md)."""
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch compute on one thread, because the head is small and more threads are slower."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def fit_uncertainty_head(
     network: Network,
     train: Images,
@@ -95,8 +108,6 @@ def fit_uncertainty_head(
         known = replace(known, x=known.x[:, :count])
     unseen = None if held_out is None else run_on_frames(network, held_out, MAX_HELD_OUT_FRAMES)
     centre, scale = standardisation(known.x, count)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the head is small, and more threads are slower
 
     def standardised(x: NDArray[np.float32]) -> NDArray[np.float32]:
         tensor = torch.from_numpy
@@ -105,20 +116,20 @@ def fit_uncertainty_head(
         ).numpy()
         return found
 
-    known_z = standardised(known.x)
-    held_out_z = None if unseen is None else replace(unseen, x=standardised(unseen.x))
-    std_layers = fit_std_layers(known_z, known.error, seed, held_out_z)
-    textures = limiting = known.texture
-    if unseen is not None:
-        limiting = unseen.texture
-    elif len(textures) >= MIN_FRAMES_TO_DIVIDE:
-        textures, limiting = textures[::2], textures[1::2]
-    views = pitched_views(train, camera or CameraParameters(), seed)
-    rate = FALSE_ALARM_RATE / 2
-    pitch_layers = fit_pitch_offset(
-        textures[:, CELL_VALUES:], views, limiting[:, CELL_VALUES:], rate, seed
-    )
-    torch.set_num_threads(threads)
+    with _one_thread():
+        known_z = standardised(known.x)
+        held_out_z = None if unseen is None else replace(unseen, x=standardised(unseen.x))
+        std_layers = fit_std_layers(known_z, known.error, seed, held_out_z)
+        textures = limiting = known.texture
+        if unseen is not None:
+            limiting = unseen.texture
+        elif len(textures) >= MIN_FRAMES_TO_DIVIDE:
+            textures, limiting = textures[::2], textures[1::2]
+        views = pitched_views(train, camera or CameraParameters(), seed)
+        rate = FALSE_ALARM_RATE / 2
+        pitch_layers = fit_pitch_offset(
+            textures[:, CELL_VALUES:], views, limiting[:, CELL_VALUES:], rate, seed
+        )
     mean, directions = fit_texture_distance(
         textures[:, :CELL_VALUES], limiting[:, :CELL_VALUES], rate
     )

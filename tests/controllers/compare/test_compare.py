@@ -17,8 +17,7 @@ from controllers.compare.config import CompareConfig
 from controllers.compare.curves import CurveRecorder
 from controllers.compare.report import driving_curves, score_table, spread, write_report
 from controllers.compare.run import Cell, cells, compare, fingerprints
-from controllers.laws.actor import WEIGHTS, load_actor
-from controllers.laws.rl import SHIPPED
+from controllers.laws.actor import SHIPPED, WEIGHTS, load_actor
 from controllers.perception.perceived import Perceived
 from runtime.files import locked_folder
 from simulator.track.catalogue import OWN_TRACKS, find_track
@@ -165,6 +164,18 @@ def test_a_drive_on_a_model_depends_on_its_weights(
     assert codes[0][0] == codes[1][0]
     assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3
     assert codes[0][2] != codes[1][2]
+
+
+def test_a_drive_of_a_shipped_actor_that_has_changed_is_driven_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = short(tmp_path, tracks="oval", controllers="rl,lqr")
+    before = [*fingerprints(config, cells(config)).values()]
+    shutil.copytree(SHIPPED / "rl-residual", tmp_path / "weights" / "rl")
+    monkeypatch.setattr(comparison, "SHIPPED", tmp_path / "weights")
+    after = [*fingerprints(config, cells(config)).values()]
+    assert before[0] != after[0]
+    assert before[1] == after[1]
 
 
 def test_a_drive_on_a_track_that_has_changed_is_driven_again(tmp_path: Path) -> None:

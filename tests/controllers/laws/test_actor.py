@@ -18,7 +18,15 @@ from safetensors.numpy import load_file, save_file
 import simulator.env  # noqa: F401 registers the environment
 from controllers.drive.closed_loop import run_lap
 from controllers.interface import LoopConfig, Observation
-from controllers.laws.actor import Actor, ActorCard, ActorError, load_actor, mirror_of, save_actor
+from controllers.laws.actor import (
+    SHIPPED,
+    Actor,
+    ActorCard,
+    ActorError,
+    load_actor,
+    mirror_of,
+    save_actor,
+)
 from controllers.laws.actor_state import (
     PAPER,
     RESIDUAL,
@@ -29,7 +37,7 @@ from controllers.laws.actor_state import (
     paper_state,
 )
 from controllers.laws.lqr import Lqr
-from controllers.laws.rl import SHIPPED, RlController, load_controller
+from controllers.laws.rl import RlController, load_controller
 from controllers.perception.sources import truth
 from controllers.registry import make_controller
 from simulator.track.catalogue import find_track

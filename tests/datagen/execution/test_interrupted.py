@@ -184,7 +184,7 @@ def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path:
     pool = ProcessPool(1, on_message, Timeouts(round_start_s=1.0, frame_s=0.0, retry_delay_s=0.2))
     (failure,) = pool.run(make_jobs(tmp_path, rounds=1, frames=100_000))
     assert failure.round_id == "round-000"
-    assert "it was not finished for 1 s" in failure.reason
+    assert "did not finish the round in 1 s" in failure.reason
     assert not failure.final
     assert len(started) == ATTEMPTS
 

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from datagen.export.lerobot_features import ACTION, IMAGE, LABELS
 from datagen.export.lerobot_stats import Histogram, column_stats
 from datagen.export.webdataset import SCHEMA_FILE
 from datagen.recording.dataset import Dataset
+from datagen.recording.folder import prepare
 from datagen.recording.manifest import rebuild
 from datagen.recording.splits import Split
 from tests.datagen.conftest import FRAMES, Samples
@@ -83,6 +85,17 @@ def test_an_absent_label_is_null_in_the_samples_and_refused_where_it_must_be_the
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(absent[0], schema)
     assert schema["properties"]["labels"]["properties"]["angle"]["x-unit"] == "rad"
+
+
+def test_names_that_differ_in_a_dot_have_different_keys(samples: Samples, tmp_path: Path) -> None:
+    prepare(tmp_path / "data")
+    for number, name in enumerate(("drive.1", "drive_1", "test")):
+        header = replace(samples.header(f"r{number:03d}"), id=name)
+        samples.add_round(tmp_path / "data", header)
+    rebuild(tmp_path / "data", Split(train=("drive.1", "drive_1"), test=("test",)))
+    export(tmp_path / "data", tmp_path / "out")
+    keys = [s["__key__"] for s in read_shards(*(tmp_path / "out").glob("*.tar"))]
+    assert len(set(keys)) == len(keys) == 3 * FRAMES
 
 
 def test_the_same_dataset_gives_the_same_bytes_and_shuffling_the_same_order(

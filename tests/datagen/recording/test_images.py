@@ -115,3 +115,8 @@ def test_a_png_is_not_decoded_unless_its_header_has_the_size_of_the_round(
     if size[0] != 640:
         with pytest.raises(ValueError, match="its header has an image size of"):
             replace(header, camera=camera).validate()
+
+
+def test_an_unknown_codec_is_an_error() -> None:
+    with pytest.raises(ValueError, match="codec 'webp', not jpeg or png"):
+        encode(np.zeros((2, 2, 3), np.uint8), "webp")
