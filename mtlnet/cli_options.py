@@ -142,8 +142,9 @@ EveryFrame = Annotated[int, typer.Option(help="Evaluate only every n-th frame.")
 Copies = Annotated[
     str,
     typer.Option(
-        help="Copies of each picture of labels.csv to evaluate too, separated by commas: mirrored, "
-        "turned (by 0.06 rad to either side).",
+        help="Evaluate also changed copies of each picture of labels.csv, separated by commas: "
+        "mirrored (one copy), turned (two copies, the camera turned by 0.06 rad to the left and to "
+        "the right).",
         show_default="none",
     ),
 ]
@@ -219,7 +220,7 @@ LabelToken = Annotated[
     Path | None,
     typer.Option(
         "--token-file",
-        help="File with the token that the page asks for.",
+        help="File that contains the token; the labelling page then asks for it.",
         show_default="$DRIVERVIEW_TOKEN",
     ),
 ]

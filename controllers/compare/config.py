@@ -21,8 +21,8 @@ class CompareConfig:
     ] = "truth"
     seeds: Annotated[
         int,
-        "Number of times that each drive is repeated, with the seeds 0, 1, ... On the truth the "
-        "seed has no effect without --disturb.",
+        "Number of times that each drive is repeated, with the seeds 0, 1, ... With perception "
+        "truth the seed has no effect without --disturb.",
     ] = 1
     disturb: Annotated[
         bool,
@@ -53,8 +53,8 @@ class TuneConfig:
     out: Annotated[Path, "File for the parameters found."] = Path("tuned.json")
     controllers: Annotated[
         str,
-        "Controllers, separated by commas: lqr, lqr-preview, lqr-paper, mpc, mpc-preview, "
-        "lqr-kalman, mpc-kalman.",
+        "Controllers, separated by commas: lqr, lqr-preview, lqr-paper, "
+        "mpc, mpc-preview, lqr-kalman, mpc-kalman.",
     ] = "lqr,mpc"
     tracks: options.Tracks = "forza"
     budget: Annotated[

@@ -1,9 +1,9 @@
 """The drives of a comparison, and the file with their results.
 
-On the truth, all drives of a controller with `update_batch` are made at once; all other drives are
-made one by one. `results.json` is {"version", "settings", "drives": [...]} and is written after
-each batch. A drive whose result is in the file is not driven again, unless its controller or model
-has changed.
+All drives with exact states (perception `truth`) of a controller with `update_batch` are made at
+once; all other drives are made one by one. `results.json` is {"version", "settings", "drives":
+[...]} and is written after each batch. A drive whose result is in the file is not driven again,
+unless its controller or model has changed.
 """
 
 import hashlib

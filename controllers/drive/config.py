@@ -57,12 +57,13 @@ class DriveConfig:
     ] = None
     throttle: Annotated[
         float | None,
-        f"Held throttle, 0 to 1, in gear 1. Default: {THROTTLE}, unless --speed is given.",
+        f"Constant throttle, 0 to 1, in gear 1. Default: {THROTTLE}. Not with --speed, which "
+        "controls the throttle.",
     ] = None
     speed: Annotated[
         float | None,
         "Speed to hold, m/s, 1 to 40; the car slows down in bends and behind traffic. Default: the "
-        "throttle is held instead.",
+        "throttle is constant.",
     ] = None
     traffic: Annotated[int, "Number of other cars, 0 to 12."] = 0
     light: options.Light = "clear"

@@ -1,7 +1,7 @@
 """Drives many cars with one controller at the same time. Compiled calls move and observe the cars.
 
 The result of a drive equals the result of `controllers.drive.run.drive` bit for bit, for any number
-of drives. All drives are on the truth, with the throttle held; each core moves a part of the cars.
+of drives. All drives have exact states and a constant throttle; each core moves a part of the cars.
 """
 
 import os
@@ -48,8 +48,8 @@ FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
     *("target_lane", "seed", "model", "light"),
 )
-"""Options that can differ from their defaults; the model and the light have no effect on the truth.
-"""
+"""Options that can differ from their defaults. The model and the light have no effect on exact
+states."""
 STEPS_BETWEEN_REPORTS = 50
 LOOP = LoopConfig(1.0 / FREQUENCY_HZ)
 PHYSICS_STEPS = PHYSICS_HZ // FREQUENCY_HZ
@@ -88,7 +88,7 @@ class _Ride:
 def can_join(config: DriveConfig) -> bool:
     """Whether `drive_many` can make a drive if its controller has `update_batch`.
 
-    The drive must be on the truth, without traffic, simulated latency, film, log or set speed.
+    The drive must have exact states, without traffic, simulated latency, film, log or set speed.
     """
     return config == replace(DriveConfig(), **{name: getattr(config, name) for name in FREE})
 

@@ -1,4 +1,4 @@
-"""The compiled control step of many drives on the truth; each car is a row of a fleet.
+"""The compiled control step of many drives with exact states; each car is a row of a fleet.
 
 Between `command_rides` and `observe_rides` the cars move (`simulator.world.control_step`). SI
 units, track frame.

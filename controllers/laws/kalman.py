@@ -163,7 +163,8 @@ def note_finite(place: int, value: float, last: Vector) -> None:
 
 @compiled
 def note_noise(measured: Vector, memory: Any) -> None:
-    """Update the variance of the noise by the third differences of the measurements (MEASURED,)."""
+    """Update `memory.noise_variance` (4,) from the third differences over time of the measured
+    offset (m), heading error (rad), lateral velocity (m/s) and yaw rate (rad/s)."""
     recent, variance = memory.recent, memory.noise_variance
     for k in range(MEASURED):
         for row in range(len(recent) - 1, 0, -1):

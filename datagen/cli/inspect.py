@@ -59,7 +59,9 @@ def export(
     kind: Annotated[
         str,
         typer.Option(
-            "--format", help="webdataset: tar shards. lerobot: a LeRobotDataset v3.0 (parquet)."
+            "--format",
+            help="Format to write: webdataset (tar files) or lerobot (LeRobotDataset v3.0, Parquet "
+            "files).",
         ),
     ] = "webdataset",
     out: Annotated[

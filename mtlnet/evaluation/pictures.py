@@ -126,7 +126,8 @@ def _pictures(answers: Answers) -> list[LabelledPicture]:
 
 
 def group_of(answers: Answers, name: str, picture: LabelledPicture, copy: str) -> str:
-    """Return the group of a picture's copy in the grouping `name`, a key of `GROUPS`."""
+    """Return the name of the group to which a picture belongs in the grouping `name`, a key of
+    `GROUPS`. `copy`: whether it is the picture as taken, mirrored or turned."""
     if name == "by_copy":
         return copy
     if name == "by_training":

@@ -74,7 +74,8 @@ def convert_run(run: Path, card: ModelCard) -> Any:
 
 
 def read_uncertainty_head(run: Path) -> UncertaintyHead:
-    """The uncertainty head of the model in `run`. Raises ModelError when it is damaged."""
+    """Load the uncertainty head of the model in the folder `run`. Raises ModelError if its file is
+    damaged."""
     path = run / UNCERTAINTY_WEIGHTS
     try:
         return load_uncertainty_head(path)

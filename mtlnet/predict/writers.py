@@ -196,8 +196,8 @@ def draw_prediction(
 
 
 def feature_lines(prediction: Prediction) -> tuple[str, str]:
-    """The features as two lines of text: distances in m; offset from the lane centre, angle and
-    class."""
+    """Return two lines of text. The first has the distances in m, the second the offset from the
+    lane centre in m, the angle in rad and the class."""
     distances = "  ".join(
         f"{name} {_metres(value)}" for name, value in prediction.distances_m.items()
     )

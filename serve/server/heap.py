@@ -19,7 +19,8 @@ class HeapTrimmer:
         self._least_bytes = _resident_bytes()
 
     def __call__(self) -> None:
-        """Trim if memory has grown. A trim takes a few ms, so call it outside the event loop."""
+        """Return free heap memory to the system if resident memory has grown by GROWTH_BYTES. This
+        takes a few ms, so call it outside the event loop."""
         resident = _resident_bytes()
         self._least_bytes = min(self._least_bytes, resident)
         if resident - self._least_bytes >= GROWTH_BYTES:

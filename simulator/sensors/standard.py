@@ -90,7 +90,7 @@ STANDARD: tuple[Sensor, ...] = (
 def camera_sensor(camera: Any, view: str = "front") -> Sensor:
     """Return a sensor that reads the image (H, W, 3) uint8 of a `simulator.camera.Camera`.
 
-    Its name is `camera`, or `camera_VIEW` for a view other than the driver's.
+    The sensor's name is `camera` for the view `front`, and `camera_VIEW` for all other views.
     """
 
     def read(world: World) -> NDArray[np.uint8]:

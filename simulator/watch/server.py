@@ -119,7 +119,8 @@ def _own_page(connection: WebSocket) -> bool:
 
 
 class Server:
-    """Serves `hub` on a bound socket, in a thread, until `stop`."""
+    """Serves the pages and messages of a `Hub` to browsers on a bound socket, in a thread, until
+    `stop` is called."""
 
     def __init__(self, hub: Hub, listener: socket.socket) -> None:
         self._listener = listener

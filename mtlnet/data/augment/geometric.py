@@ -99,7 +99,8 @@ def rotations() -> NDArray[np.float64]:
 
 
 def rotate(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> None:
-    """Rotate the camera of an image (H, W, 3) by rotation `number`, in place."""
+    """Replace an image (H, W, 3) by the image of a rotated camera; `number` is the row of
+    `rotations` with the angles."""
     coarse, fine = rotation_maps(camera, number)
     border = cv2.BORDER_REFLECT_101
     cv2.remap(image.copy(), coarse, fine, cv2.INTER_LINEAR, dst=image, borderMode=border)

@@ -75,8 +75,9 @@ class TaskWeighting:
 
     @torch.no_grad()
     def update(self, terms: Tensor) -> None:
-        """Add the loss terms (3,) of a step, averaged over the whole batch; a full window of steps
-        sets new weights. Does nothing unless the method is `dwa`."""
+        """Add the loss terms (3,) of a step, averaged over the whole batch, to the sums of the
+        window. After `window` steps, compute new weights. Does nothing unless the method is `dwa`.
+        """
         if self.method != "dwa":
             return
         self.sums += terms
