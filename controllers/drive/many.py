@@ -48,7 +48,7 @@ FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
     *("target_lane", "seed", "model", "light"),
 )
-"""Options that can differ from their defaults. The model and the light have no effect on exact
+"""Options that can differ from their defaults. The model and the light do not change exact
 states."""
 STEPS_BETWEEN_REPORTS = 50
 LOOP = LoopConfig(1.0 / FREQUENCY_HZ)

@@ -1,8 +1,9 @@
 """Pedals that hold a set speed (`controllers drive --speed`) and slow down in bends and traffic.
 
 The speed law of the scripted drivers (`simulator.driving.speed`) sets throttle, brake and gear.
-This module limits its target speed to what the road allows: with exact states by the curvature ahead, with
-a model's answers by the class of the road and the car's own yaw rate. SI units, left positive.
+This module limits its target speed to what the road allows. The limit follows from the curvature
+ahead with exact states, and from the class of the road and the car's yaw rate with a model's
+answers. SI units, left positive.
 """
 
 import math
