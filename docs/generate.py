@@ -48,7 +48,7 @@ def _describe(words: tuple[str, ...], command: Any) -> list[str]:
     parts = [f"### {' '.join(words)}", inspect.cleandoc(command.help or "").replace("\x08\n", "")]
     shown = [p for p in command.params if p.name != "help" and not getattr(p, "hidden", False)]
     if shown:
-        rows = ["| | default | |", "|---|---|---|"]
+        rows = ["| argument or option | default | meaning |", "|---|---|---|"]
         for p in shown:
             rows.append(f"| `{_name(p)}` | {_default(p)} | {_cell(getattr(p, 'help', ''))} |")
         parts.append("\n".join(rows))
@@ -84,7 +84,7 @@ def _openapi() -> dict[str, Any]:
 
 def operations() -> str:
     """The operations of the OpenAPI document."""
-    rows = ["| operation | |", "|---|---|"]
+    rows = ["| operation | answer |", "|---|---|"]
     for path, methods in _openapi()["paths"].items():
         for method, about in methods.items():
             rows.append(f"| `{method.upper()} {path}` | {_cell(about.get('summary'))} |")
@@ -94,7 +94,7 @@ def operations() -> str:
 def answer() -> str:
     """The fields of the answer of `POST /features`, those of its objects too."""
     schemas = _openapi()["components"]["schemas"]
-    rows = ["| field | |", "|---|---|"]
+    rows = ["| field | meaning |", "|---|---|"]
     for name, field in schemas["Features"]["properties"].items():
         schema = _object(schemas, field)
         about = (schema.get("description", "").rstrip("."), field.get("description"))
@@ -117,7 +117,7 @@ def problems() -> str:
     from serve import problems as module
 
     kinds = sorted((k.status, k.name, k.title) for k in module.PROBLEM_TYPES)
-    rows = ["| status | type | |", "|---|---|---|"]
+    rows = ["| status | name | meaning |", "|---|---|---|"]
     return "\n".join(rows + [f"| {status} | `{name}` | {title} |" for status, name, title in kinds])
 
 
@@ -127,7 +127,7 @@ def messages() -> str:
 
     parts = []
     for name, message in json_schema()["$defs"].items():
-        rows = [f"### {name}\n", "| field | unit | | frame, reference point | absent |"]
+        rows = [f"### {name}\n", "| field | unit | meaning | frame, reference point | absent if |"]
         rows.append("|---|---|---|---|---|")
         for field, about in message["properties"].items():
             place = ", ".join(filter(None, map(about.get, ("x-frame", "x-reference-point"))))
@@ -146,7 +146,7 @@ def header() -> str:
 
 def errors() -> str:
     """The classes of errors that users meet, by package."""
-    rows = ["| class | kind of | |", "|---|---|---|"]
+    rows = ["| class | base classes | meaning |", "|---|---|---|"]
     for name, (module, bases, about) in sorted(error_classes().items()):
         rows.append(
             f"| `{module}.{name}` | {', '.join(f'`{b}`' for b in bases)} | {_cell(about)} |"
