@@ -148,14 +148,14 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     assert engine.card.model_hash in page
     error = found["errors"]["ml"]
     assert f"| `ml` (m) | {error['mean']:.3f} | {error['median']:.3f} |" in page
-    assert f"Class right: {found['heading_accuracy']:.1%}" in page
+    assert f"Correct class of the road: {found['heading_accuracy']:.1%} of the" in page
     light = found["by_light"]["clear"]
     pair = ", ".join(f"{light['errors'][name]['mean']:.3f}" for name in ("ml", "mr"))
     assert f"| light: clear | {light['frames']} | {pair} |" in page
     rows = [line for line in page.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in rows} == {10, 12}, "every row has all its cells"
 
-    assert "Before on" not in page
+    assert "Earlier" not in page
     earlier = [{"frames": 250000, "content_hash": "c0ffee"}]
     tracks = ["oval", "random:12", "random:7", "town"]
     data = {**engine.card.data, "tracks": tracks, "earlier": earlier}
@@ -167,8 +167,9 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     write_export(continued / INT8, engine.card, (), gate=judged)
     page = write_page(continued, [file]).read_text()
     assert "frames of the tracks oval, town and of 2 random roads (content hash" in page
-    assert "Before on 250000 other frames (content hash `c0ffee`)." in page
-    assert "It failed its accuracy gate: errors above those of float32, on 24 test frames." in page
+    assert "Earlier it was trained on 250000 other frames (content hash `c0ffee`)." in page
+    assert "The int8 graph failed its accuracy gate." in page
+    assert "in float32, on 24 test frames." in page
     assert "| `ml` (m) | +0.0000 | 0.003 |\n| `mr` (m) |" in page
     assert "| `angle` (rad) | +0.00030 | 0.0002 |\n| wrong class (points) | +0.00 | 0.1 |" in page
     write_export(continued / INT8, replace(engine.card, files={WEIGHTS: "0"}), (), gate=judged)
