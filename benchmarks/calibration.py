@@ -48,7 +48,7 @@ SPEEDS_KMH = (50.0, 75.0)
 
 @dataclass(frozen=True)
 class Mount:
-    """A camera's lens and mount, and the road it films. Angles in degrees."""
+    """Field of view and mount of a camera, and the drive that it films. Angles in degrees."""
 
     pitch_deg: float
     yaw_deg: float
@@ -61,7 +61,7 @@ class Mount:
     light: str
     speed_kmh: float
     start: float
-    """Share of the lap."""
+    """Where the drive starts, as a share of the lap."""
 
 
 def random_mount(seed: int) -> Mount:
@@ -82,7 +82,7 @@ def random_mount(seed: int) -> Mount:
 
 
 def render_film(mount: Mount, path: Path, seconds: float, seed: int) -> None:
-    """Film `seconds` of the scripted driver's drive from the camera of `mount`."""
+    """Write a film of `seconds` of the scripted driver's drive, seen by the camera of `mount`."""
     road = Road(find_track(mount.track), mount.lanes, mount.lane_width_m)
     course = make_course("lane", road, 25.0 * seconds, np.random.default_rng([seed, 36]))
     driver = ScriptedDriver(road, course, mount.speed_kmh / 3.6, FPS * 2)
@@ -109,7 +109,7 @@ def render_film(mount: Mount, path: Path, seconds: float, seed: int) -> None:
 
 
 def _euler(turn: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Roll, pitch and yaw (rad) of a rotation, as `rotation` takes them."""
+    """Roll, pitch and yaw (rad) of a rotation matrix (3, 3): the inverse of `rotation`."""
     return (
         float(np.arctan2(turn[2, 1], turn[2, 2])),
         float(-np.arcsin(turn[2, 0])),
@@ -118,7 +118,10 @@ def _euler(turn: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def errors(mount: Mount, path: Path) -> dict[str, float]:
-    """Signed errors of the film's calibration, and its standard deviations."""
+    """Signed errors of the calibration of the film at `path`, and its standard deviations.
+
+    Angles in degrees; the height is relative to the true height.
+    """
 
     def lens(size: tuple[int, int]) -> KnownLens:
         return find_lens(size, CameraParameters(), fov_y_deg=mount.fov_y_deg)
@@ -139,7 +142,10 @@ def errors(mount: Mount, path: Path) -> dict[str, float]:
 
 
 def real_pitch(folder: Path) -> dict[str, float] | None:
-    """Pitch of the pictures in a row of `REAL_DRIVE`, and that of their labels' horizon."""
+    """Calibrated pitch of the pictures of REAL_DRIVE, and the pitch by the horizon of their labels.
+
+    Returns None if `folder` has no labels.csv.
+    """
     if not (folder / "labels.csv").is_file():
         return None
     with (folder / "labels.csv").open() as file:

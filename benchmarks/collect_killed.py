@@ -34,17 +34,17 @@ from benchmarks.claims.outcome import conclude, run_command
 TRACKS = "oval,circuit"
 WARM_UP = ("--rounds", "2", "--frames", "2")
 LONGEST_PART = 1.3
-"""Kills come within so many times the length of an undisturbed run; later ones come too late."""
+"""Latest time of a kill, as a multiple of the duration of an undisturbed run."""
 
 POLL_S = 0.001
 
-Finished = dict[str, tuple[str, int]]
-Occurred = Callable[[Path], int]  # how often, so far
+Finished = dict[str, tuple[str, int]]  # round -> (SHA-256, modification time in ns)
+Occurred = Callable[[Path], int]  # how often an event has occurred in the folder so far
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that shows in the folder; `within_s` of it a kill is worth its while."""
+    """A change in the folder of a collection; a kill follows at most `within_s` after it."""
 
     occurred: Occurred
     within_s: float
@@ -70,7 +70,7 @@ class Moment:
         kind = rng.choice(["any", "any", *EVENTS, "last"])
         if kind == "any" or done == rounds:
             return Moment(rng.uniform(0.0, LONGEST_PART * seconds))
-        if kind == "last":  # statistics, split, card and manifest are written after it
+        if kind == "last":  # statistics, split, card and manifest follow the last round
             return Moment(rng.uniform(0.0, 0.6), EVENTS["stated"], rounds - done)
         event = EVENTS[kind]
         return Moment(rng.uniform(0.0, event.within_s), event, rng.randint(1, 3))
@@ -95,14 +95,17 @@ def command(out: Path, options: tuple[str, ...]) -> list[str]:
 
 
 def collect(out: Path, options: tuple[str, ...]) -> float:
-    """Undisturbed; seconds."""
+    """Collect into `out` without a kill; return the seconds that it took."""
     started = time.monotonic()
     subprocess.run(command(out, options), check=True, capture_output=True)
     return time.monotonic() - started
 
 
 def collect_until(out: Path, options: tuple[str, ...], moment: Moment) -> str:
-    """Kill the tree at that moment: the phase it was in; empty when it was through before."""
+    """Collect and kill all processes at `moment`; return the phase in which they were killed.
+
+    Returns "" if the collection ended before. Raises RuntimeError if it failed by itself.
+    """
     process = subprocess.Popen(
         command(out, options),
         stdout=subprocess.DEVNULL,
@@ -123,17 +126,17 @@ def collect_until(out: Path, options: tuple[str, ...], moment: Moment) -> str:
 
 
 def await_event(process: subprocess.Popen[bytes], out: Path, event: Event, times: int) -> None:
-    """Until it has occurred so often, or the collection is through."""
+    """Wait until `event` has occurred `times` more times, or the collection has ended."""
     seen = event.occurred(out)
     while times > 0 and process.poll() is None:
-        now = event.occurred(out)  # less than before when leftovers were swept away
+        now = event.occurred(out)  # falls when the collection removes leftovers
         times -= max(now - seen, 0)
         seen = now
         time.sleep(POLL_S)
 
 
 def phase(out: Path) -> str:
-    """What a killed collection was at, by what it has left."""
+    """The phase in which a collection was killed, derived from the files in its folder."""
     if not (out / "plan.json").is_file():
         return "planning"
     partial = [file.stat().st_size for file in out.glob(".partial/*/round.mcap")]
@@ -154,7 +157,7 @@ def _number(out: Path, pattern: str) -> int:
 
 
 def finished(out: Path) -> Finished:
-    """Hash and time of writing of every round that has its state."""
+    """SHA-256 and modification time (ns) of every round that has a state file."""
     found = {}
     for state in out.glob("state/*.json"):
         path = out / "rounds" / f"{state.stem}.mcap"
@@ -164,7 +167,7 @@ def finished(out: Path) -> Finished:
 
 
 def content_hash(out: Path) -> tuple[str, bool]:
-    """The dataset's hash and whether `verify --level full` finds it in order."""
+    """The dataset's content hash, and whether `datagen verify --level full` finds no problem."""
     done = subprocess.run(
         [sys.executable, "-m", "datagen", "verify", str(out), "--level", "full", "--json"],
         capture_output=True,

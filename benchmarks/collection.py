@@ -32,9 +32,9 @@ FRAMES_OF_WARM_UP = 20
 
 
 def collect_timed(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
-    """The result of `datagen collect`, and the processor time of all its processes."""
+    """Run `datagen collect`; return its result and, as `cpu_s`, the processor time in s."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    # A training set: more sceneries to build than a film has.
+    # stretch=1: every frame has another scenery, as in a training set.
     found = collect(out, rounds=rounds, frames=frames, seed=seed, stretch=1)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -42,7 +42,10 @@ def collect_timed(out: Path, rounds: int, frames: int, seed: int) -> dict[str, A
 
 
 def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
-    """Simulate a round of the plan and render it: number of frames, wall and processor seconds."""
+    """Simulate and render a round of the plan.
+
+    Returns the number of frames, and wall time and processor time of rendering in s.
+    """
     # One thread per process for Mesa and numpy, as in the collector's workers.
     os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
     from datagen.planning.plan import RoundPlan

@@ -33,7 +33,7 @@ LIMIT_S = 360.0
 
 
 def tasks_of(controller: str, share: float) -> tuple[list[Task], int]:
-    """The drives of the benchmark over a `share` of their steps, and the sum of all steps."""
+    """The benchmark's drives, each with a `share` of its steps; and the sum of all their steps."""
     tasks, whole = [], 0
     for track in list_tracks():
         steps = steps_for(None, track.name, track.length_m)
@@ -52,7 +52,10 @@ def tasks_of(controller: str, share: float) -> tuple[list[Task], int]:
 
 
 def measure(controller: str, share: float) -> dict[str, float | bool]:
-    """The processor time of the whole benchmark, and that of a step alone and at once."""
+    """Make all drives of a controller at once and one drive alone; return the processor times.
+
+    The times are in s for the whole benchmark (extrapolated) and in us per step.
+    """
     tasks, whole = tasks_of(controller, share)
     for _ in drive_many(tasks[:1]):  # compiles
         pass

@@ -39,11 +39,11 @@ P99_MS = {
     "mpc-preview": 1.0,
 }
 IMAGES, IMAGES_P99_MS = "lqr on images", 25.0
-WARM_UP = 20  # steps on images before the first that counts
+WARM_UP = 20  # steps on images that are driven first and not counted
 
 
 class Timed:
-    """A function whose calls are timed, in ms."""
+    """Calls a function of one argument and stores the wall time of each call in `times_ms`."""
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
         self._function = function
@@ -57,7 +57,7 @@ class Timed:
 
 
 class TimedController:
-    """A controller whose steps are timed."""
+    """Wraps a controller and times its `update`; the times are in `timed.times_ms`."""
 
     def __init__(self, controller: Controller) -> None:
         self.timed = Timed(controller.update)
@@ -67,7 +67,10 @@ class TimedController:
 
 
 def on_images(world: World, model: str, steps: int) -> list[float]:
-    """The times (ms) of steps on images: rendering, the service's answer and the controller."""
+    """Drive `steps` steps with `lqr` on the service's answers; return the time of each step in ms.
+
+    A step contains rendering, the request to the service and the controller.
+    """
     with running(OURS, Path(sys.executable), Path(model), workers=1) as port:
         address = f"http://127.0.0.1:{port}"
         settings: dict[str, Any] = {"model": model, "lane_centre": 0.0, "light": "clear", "seed": 0}

@@ -61,13 +61,16 @@ ExpectedAnswers = dict[str, list[dict[str, Any]]]  # model hash -> its answers t
 
 @dataclass
 class ModelHistory:
-    """Which model was loaded when: the first one, and the begin, end and model of each reload."""
+    """The models that were loaded: hash of the first one, and (begin, end, hash) of each reload.
+
+    Times are of `time.monotonic()` in s.
+    """
 
     first: str
     reloads: list[tuple[float, float, str]] = field(default_factory=list)
 
     def allowed(self, sent: float, received: float) -> set[str]:
-        """The models that may answer a request of which these are the times."""
+        """The models that were loaded at some moment between `sent` and `received` (s)."""
         model, models = self.first, set()
         since = -1.0
         for begin, end, next_model in [*self.reloads, (float("inf"), float("inf"), "")]:
@@ -81,8 +84,9 @@ class ModelHistory:
 class ClientLog:
     """What one client received.
 
-    Of an answer: when its request was sent, when it was received, its model, and whether it is
-    bit-equal to what that model predicts. (Two hours of whole answers would take gigabytes.)
+    An entry of `answers` has the times of request and answer (s), the hash of the model, and
+    whether the answer is bit-equal to the model's prediction. Whole answers are not kept, because
+    those of two hours would take gigabytes. `missed` counts requests that were not sent in time.
     """
 
     answers: list[tuple[float, float, str, bool]] = field(default_factory=list)
@@ -99,7 +103,10 @@ def send_requests(
     end: float,
     log: ClientLog,
 ) -> None:
-    """Send requests at 20 Hz until `end`; the clients' phases are spread over a period."""
+    """Send requests at 20 Hz until `end` (s, monotonic) and write the answers to `log`.
+
+    Client `number` starts `number` / CLIENTS of a period later, so that not all send at once.
+    """
     begin = time.monotonic() + number / CLIENTS / HERTZ
     with Client(f"127.0.0.1:{port}", timeout_s=10.0) as client:
         turn = 0
@@ -127,7 +134,10 @@ def send_requests(
 def clients(
     port: int, images: list[bytes], expected: ExpectedAnswers, end: float, logs: list[ClientLog]
 ) -> Iterator[None]:
-    """A client for each log, sending requests until `end`. Waits for them; raises what they do."""
+    """Run a client for each log until `end`. On exit, wait for the clients and raise their errors.
+
+    `end`: s, monotonic.
+    """
     with ThreadPoolExecutor(len(logs)) as pool:
         running_clients = [
             pool.submit(send_requests, port, number, images, expected, end, log)
@@ -141,7 +151,10 @@ def clients(
 def reload_and_restart(
     port: int, runs: list[Path], history: ModelHistory, end: float
 ) -> Counter[str]:
-    """Reload and restart at their intervals until `end`. Returns how often each was done."""
+    """Reload the model every minute and restart the workers every five minutes until `end`.
+
+    Returns how often each was done.
+    """
     done: Counter[str] = Counter()
     begin = time.monotonic()
     plans: dict[str, tuple[float, Callable[[], object]]] = {
@@ -164,7 +177,7 @@ def _reload(port: int, run: Path, history: ModelHistory) -> None:
 
 
 def expected_answers(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
-    """What the model of `run` predicts for the images, in this process."""
+    """Answers (JSON) of the model in the folder `run` to the images, computed in this process."""
     engine = load_engine(run)
     camera = engine.card.camera
     return [
@@ -176,7 +189,7 @@ def expected_answers(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
 
 
 def is_correct(answer: dict[str, Any], which: int, expected: ExpectedAnswers) -> bool:
-    """Whether an answer is bit-equal to what the model that it names predicts."""
+    """Whether an answer to image number `which` is bit-equal to the prediction of its model."""
     if answer["model"] not in expected:
         return False
     prediction = expected[answer["model"]][which]
@@ -184,7 +197,7 @@ def is_correct(answer: dict[str, Any], which: int, expected: ExpectedAnswers) ->
 
 
 def wrong_answers(log: ClientLog, history: ModelHistory) -> list[str]:
-    """A line for each answer of a model that was not loaded, or that its model does not predict."""
+    """A message for each answer whose model was not loaded, or that differs from its prediction."""
     found = []
     for sent, received, model, correct in log.answers:
         if model not in history.allowed(sent, received):
@@ -195,7 +208,10 @@ def wrong_answers(log: ClientLog, history: ModelHistory) -> list[str]:
 
 
 def measure(minutes: float, folder: Path) -> dict[str, Any]:
-    """The figures of a run."""
+    """Run the clients with reloads and restarts for `minutes`; return the figures.
+
+    `folder` is for the two models.
+    """
     images = [jpeg(np.roll(picture(), 17 * number, axis=1)) for number in range(IMAGES)]
     runs = [folder / "one", folder / "other"]
     for seed, run in enumerate(runs):
@@ -229,14 +245,17 @@ def measure(minutes: float, folder: Path) -> dict[str, Any]:
 
 @dataclass
 class Memory:
-    """The resident memory of some processes, MB, by time; a process that has ended is a fault."""
+    """Samples (time in s, MB) of the resident memory of some processes, in all.
+
+    `fault` is a message if one of the processes has ended.
+    """
 
     pids: list[int]
     samples: list[tuple[float, float]] = field(default_factory=list)
     fault: str = ""
 
     def watch(self, end: float) -> None:
-        """Sample once a second until `end`; report every ten minutes."""
+        """Take a sample every second until `end`; print the memory every ten minutes."""
         report = time.monotonic() + PART_S
         while (now := time.monotonic()) < end and not self.fault:
             if now >= report:
@@ -252,12 +271,12 @@ class Memory:
             time.sleep(1.0)
 
     def median(self, begin: float, end: float) -> float:
-        """Of the samples in a part of the time, MB."""
+        """Median of the samples from `begin` to `end` (s), in MB."""
         return median(mb for when, mb in self.samples if begin <= when < end)
 
 
 def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
-    """The figures of a run beside malicious clients."""
+    """Run the clients together with malicious clients for `minutes`; return the figures."""
     images = [jpeg(np.roll(picture(), 17 * number, axis=1)) for number in range(IMAGES)]
     run = folder / "run"
     publish_untrained(run, seed=3)
@@ -277,7 +296,7 @@ def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
 def attacked_figures(
     logs: list[ClientLog], memory: Memory, history: ModelHistory, begin: float, end: float
 ) -> dict[str, Any]:
-    """The figures from `begin` to `end`, and whether the claims are reached."""
+    """The figures from `begin` to `end` (s, monotonic), and whether the claims are reached."""
     faults = [fault for log in logs for fault in [*log.lost, *wrong_answers(log, history)]]
     faults += [memory.fault] if memory.fault else []
     answers = [(sent, 1e3 * (done - sent)) for log in logs for sent, done, _, _ in log.answers]
@@ -310,7 +329,7 @@ def attacked_figures(
 
 
 def counted(port: int) -> int:
-    """The frames that the service counts as answered, in all workers."""
+    """The number of answered frames in all workers, read from the service's /metrics."""
     with urlopen(f"http://127.0.0.1:{port}/metrics") as page:
         found = COUNTED.findall(page.read().decode())
     return round(sum(map(float, found)))

@@ -32,11 +32,11 @@ from mtlnet.sources.read import SourceImage
 
 CLAIM_FPS = 45.0
 CORES = 2
-KEPT = 60
+KEPT = 60  # pictures with which the parts after decoding are timed
 
 
 def make_film(path: Path, seconds: float) -> bool:
-    """Whether there is an FFmpeg program to make it."""
+    """Write an H.264 film of `seconds` s to `path`; return False if imageio-ffmpeg is missing."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:
@@ -49,14 +49,14 @@ def make_film(path: Path, seconds: float) -> bool:
 
 
 def cpu_ms(work: Callable[[], int]) -> float:
-    """CPU time of `work` in ms for each of the pictures that it counts."""
+    """CPU time of `work` in ms per picture; `work` returns the number of its pictures."""
     begin = process_time()
     count = work()
     return 1e3 * (process_time() - begin) / count
 
 
 def parts(film: Path, model: str, folder: Path) -> dict[str, float]:
-    """CPU time of each part, ms a picture."""
+    """CPU time in ms per picture of each part: decode, scale, network, draw and encode."""
     engine = load_engine(resolve_run(model))
     camera = engine.card.camera
     pictures: list[Picture] = []

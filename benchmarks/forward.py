@@ -48,7 +48,7 @@ Forward = Callable[[NDArray[np.uint8]], Any]
 
 
 def torch_pass(run: Path) -> Forward:
-    """The network in float32, channels-last, on one thread."""
+    """A function that runs the torch network in float32, channels-last, on one thread."""
     torch.set_num_threads(1)
     network = load_network(run / WEIGHTS, read_card(run).network)
     network.to(memory_format=torch.channels_last)
@@ -63,7 +63,10 @@ def torch_pass(run: Path) -> Forward:
 def openvino_pass(
     run: Path, images: NDArray[np.uint8] | None, *, uncertainty: bool = False
 ) -> Forward:
-    """The OpenVINO graph in bf16, or in int8 calibrated on `images`."""
+    """A function that runs the OpenVINO graph on one thread.
+
+    The graph is in bf16, or in int8 if `images` (N, H, W, 3) are given to calibrate it.
+    """
     if uncertainty:
         graph = read_graph(run, read_card(run))
     else:

@@ -45,7 +45,7 @@ def main() -> int:
     found, lacks = machine.missing_at_all(gpu=not given.rehearse)
     if lacks:
         return not_measured("\n  ".join(["this machine lacks", *lacks]))
-    from benchmarks.gpu.running import run_all  # it imports what the wheels brought
+    from benchmarks.gpu.running import run_all  # imports packages that the wheels installed
 
     return run_all(
         work,
@@ -83,7 +83,7 @@ def parse() -> argparse.Namespace:
 
 
 def commit() -> str:
-    """The commit of this checkout; empty where git does not know it."""
+    """Hash of this checkout's commit; empty if git is missing or this is no git repository."""
     command = ["git", "rev-parse", "HEAD"]
     try:
         done = subprocess.run(command, cwd=wheels.ROOT, capture_output=True, text=True, check=False)

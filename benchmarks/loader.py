@@ -38,7 +38,7 @@ ROUNDS = 60
 BATCH = 32
 CORES = len(os.sched_getaffinity(0))
 
-Read = Callable[[], int]  # reads some images, returns how many
+Read = Callable[[], int]  # reads some images and returns their number
 
 
 def decoder(frames: Frames, order: NDArray[np.int64]) -> Read:
@@ -99,7 +99,7 @@ def dataloader(frames: Frames, batches: int) -> Read:
 
 
 def mcap_reader(frames: Frames, order: NDArray[np.int64], count: int) -> Read:
-    """Item by item with the official library: seek to the log time, read, decode."""
+    """A `Read` of `count` images, each with the official library: seek, read, decode."""
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from mcap.reader import make_reader
 

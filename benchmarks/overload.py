@@ -40,13 +40,13 @@ from serve.config import Limits
 OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
 BUSY = 4  # clients that keep one worker busy; its queue has room for their frames
 CONNECTIONS = 64  # of the load generator under overload
-SLOW = 1000
-SETTLE_S = 3.0
+SLOW = 1000  # slow connections
+SETTLE_S = 3.0  # for the slow connections to open
 SERVER, CLIENTS = {0}, {1}  # cores
 
 
 def overload(loader: Loader, port: int, seconds: float) -> dict[str, Any]:
-    """One client, the peak, five times the peak."""
+    """Load the service for `seconds` each with one client, at its peak, and at five times that."""
     loader.run(port, 1, 1.0)
     alone = loader.run(port, 1, seconds)
     peak = loader.run(port, BUSY, seconds).per_second()
@@ -66,7 +66,8 @@ def overload(loader: Loader, port: int, seconds: float) -> dict[str, Any]:
 
 
 def beside_slow_ones(loader: Loader, port: int, seconds: float, rate: float) -> dict[str, Any]:
-    """Four clients at `rate`, without and with a crowd of slow connections."""
+    """Load the service with four clients at `rate` requests per second, in all; then again together
+    with slow connections. Return both p99 and the requests that were not answered."""
     before = loader.run(port, BUSY, seconds, rate)
     with crowd(port):
         beside = loader.run(port, BUSY, seconds, rate)
@@ -79,7 +80,7 @@ def beside_slow_ones(loader: Loader, port: int, seconds: float, rate: float) -> 
 
 @contextmanager
 def crowd(port: int) -> Iterator[None]:
-    """1,000 slow connections."""
+    """Hold SLOW slow connections to the service open while the context lasts."""
     process = subprocess.Popen(
         [sys.executable, str(HERE / "slow_clients.py"), str(port), str(SLOW)],
         preexec_fn=lambda: os.sched_setaffinity(0, CLIENTS),
@@ -93,7 +94,7 @@ def crowd(port: int) -> Iterator[None]:
 
 
 def judge(found: dict[str, Any]) -> dict[str, bool]:
-    """Which claims hold for these figures."""
+    """Whether each claim holds for the figures of our service."""
     queue_ms = Limits().queue * 1e3 / found["peak_per_second"]
     return {
         "admitted": found["admitted_p99_ms"] <= 2 * found["alone_p99_ms"] + queue_ms,

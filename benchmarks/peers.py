@@ -43,7 +43,7 @@ CLIENTS, WORKERS = 8, 2
 
 
 def latency(servers: dict[str, Path], run: Path, requests: int) -> dict[str, list[float]]:
-    """Times of requests to each server, ms."""
+    """Times in ms of `requests` requests to each server, sent in turns of TURN requests."""
     found: dict[str, list[float]] = {name: [] for name in servers}
     with ExitStack() as stack:
         ports = {
@@ -57,7 +57,7 @@ def latency(servers: dict[str, Path], run: Path, requests: int) -> dict[str, lis
 
 
 def ask(port: int, count: int) -> list[float]:
-    """Times of `count` requests over a new connection, ms, after one that is not counted."""
+    """Send `count` requests over a new connection, after one that is not counted; times in ms."""
     sent, times = request(), []
     with connect(("127.0.0.1", port)) as connection:
         exchange(connection, sent)
@@ -69,7 +69,7 @@ def ask(port: int, count: int) -> list[float]:
 
 
 def throughput(servers: dict[str, Path], run: Path, seconds: float, turns: int) -> dict[str, Any]:
-    """Answers a second and the p99 of their times, ms, of each server: medians over the turns."""
+    """Answers per second of each server and the p99 of their times in ms: medians of the turns."""
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in servers}
     with tempfile.TemporaryDirectory() as folder:
         loader = Loader(Path(folder))
@@ -86,7 +86,7 @@ def throughput(servers: dict[str, Path], run: Path, seconds: float, turns: int) 
 
 
 def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
-    """Our figures over a peer's, and whether the claims hold."""
+    """Our p50 and throughput divided by the peer's, the limits, and whether they are kept."""
     p50, rate = ours["p50_ms"] / theirs["p50_ms"], ours["per_second"] / theirs["per_second"]
     slowest, fewest = CLAIMS[name]
     held = p50 <= slowest and rate >= fewest

@@ -15,7 +15,7 @@ from benchmarks.recordings.enlarged import collect
 
 
 def same_rounds(one: Path, other: Path) -> bool:
-    """Names and bytes."""
+    """Whether the rounds of two datasets have the same names and bytes."""
     first, second = (
         {path.name: path.read_bytes() for path in (folder / "rounds").iterdir()}
         for folder in (one, other)

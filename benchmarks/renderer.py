@@ -53,12 +53,15 @@ Job = Callable[[int], float]
 
 
 def clock() -> float:
-    """Processor time of the process where the CPU renders, else wall time."""
+    """Time in s: processor time of this process if the CPU renders, else wall time."""
     return time.process_time() if "llvmpipe" in graphics().renderer else time.perf_counter()
 
 
 def camera_job(camera: Camera, views: tuple[str, ...] = ("front",), cars: int = 0) -> Job:
-    """Images from positions all along the road of `camera`, with `cars` cars standing ahead."""
+    """A Job that renders `views` from FRAMES positions along the road of `camera`.
+
+    `cars` cars stand ahead of each position.
+    """
     road = camera.road
     places = np.linspace(0.0, road.track.length_m, FRAMES, endpoint=False)
     shots = [
@@ -80,12 +83,12 @@ def camera_job(camera: Camera, views: tuple[str, ...] = ("front",), cars: int = 
 
 
 def environment_job(env: gym.Env[Any, Any]) -> Job:
-    """Steps of our environment, steered by the true state."""
+    """A Job that steps an environment of this project; the true state determines the steering."""
     return _stepping(env, lambda info: _steering(info))
 
 
 def car_racing_job() -> Job:
-    """Steps of CarRacing-v3 with its 96 x 96 picture."""
+    """A Job that steps CarRacing-v3, which draws a picture of 96 x 96 px in each step."""
     return _stepping(
         gym.make("CarRacing-v3"), lambda info: np.array([0.0, 0.1, 0.0], dtype=np.float32)
     )
@@ -115,7 +118,7 @@ def _steering(info: dict[str, Any]) -> np.ndarray[Any, Any]:
 
 
 def frames_per_second(jobs: dict[str, Job], turns: int) -> dict[str, float]:
-    """Median frames a second of each job, taking turns."""
+    """Median frames per second of each job; the jobs take turns."""
     figures: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(turns + 1):
         for name, job in jobs.items():
@@ -161,7 +164,7 @@ def kinds(stack: ExitStack) -> Iterator[tuple[str, Job]]:
 
 
 def measure(turns: int) -> dict[str, dict[str, float]]:
-    """Frames a second of all jobs, by group."""
+    """Frames per second of all jobs, by group."""
     figures = {}
     for group in (environments, cameras, sizes, kinds):
         with ExitStack() as stack:
@@ -173,7 +176,7 @@ def measure(turns: int) -> dict[str, dict[str, float]]:
 
 
 def main(quick: bool = False, json: Path | None = None) -> None:
-    warnings.simplefilter("ignore")  # the peers' own
+    warnings.simplefilter("ignore")  # the peers print warnings
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     figures = measure(1 if quick else TURNS)
     peer = figures["environments"].pop("CarRacing-v3, 96 x 96")

@@ -44,7 +44,7 @@ Step = tuple[Any, float, bool, bool, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: the environment's options, the seed of its reset and of its actions."""
+    """One episode: options and start of its environment, and the seed of reset and actions."""
 
     number: int
     seed: int
@@ -54,7 +54,7 @@ class Episode:
 
 
 def plan(count: int) -> list[Episode]:
-    """`count` random episodes, the same every time."""
+    """`count` random episodes; each call returns the same ones."""
     return [random_episode(number) for number in range(count)]
 
 
@@ -86,8 +86,10 @@ def random_episode(number: int) -> Episode:
 
 
 class Fingerprint(gym.Wrapper[Any, Any, Any, Any]):
-    """Chooses the actions of an episode itself, hashes all that comes of them, and tells in
-    `info["digest"]`; an episode that ended stays as it was."""
+    """Chooses the actions of an episode itself and hashes all results of its steps.
+
+    `info["digest"]` is the SHA-256 so far. Steps after the end of the episode change nothing.
+    """
 
     def __init__(self, env: gym.Env[Any, Any], episode: Episode) -> None:
         super().__init__(env)
@@ -109,7 +111,7 @@ class Fingerprint(gym.Wrapper[Any, Any, Any, Any]):
         observation, reward, over, _, info = self.env.step(self._action(self._info))
         self._hash.update(struct.pack("<d?", reward, over))
         observation, self._info = self._told(observation, info)
-        # The vector is to go on till all episodes are over: an end is told in the digest only.
+        # The vector must go on until all episodes are over, so an end changes only the digest.
         taken = observation, float(reward), False, False, self._info
         self._end = taken if over else None
         return taken
@@ -124,14 +126,14 @@ class Fingerprint(gym.Wrapper[Any, Any, Any, Any]):
         world = self.unwrapped.world  # type: ignore[attr-defined]
         for part in parts(observation):
             self._hash.update(part)
-        # repr of a float is exact: two that differ in one bit differ in it.
+        # repr of a float is exact: floats that differ in one bit have different texts.
         self._hash.update(repr((astuple(world.state), world.traffic.poses().tolist())).encode())
         self._hash.update(repr((world.features(), info)).encode())
         return observation, info | {"digest": self._hash.hexdigest()}
 
 
 def parts(observation: Any) -> Iterator[bytes]:
-    """The bytes of an observation's arrays, by name."""
+    """Yield name and bytes of each array of an observation, in the order of the names."""
     for name in sorted(observation):
         yield name.encode() + observation[name].tobytes()
 
@@ -145,7 +147,7 @@ def maker(episode: Episode) -> Callable[[], gym.Env[Any, Any]]:
 
 
 def run_alone(episodes: list[Episode]) -> dict[int, str]:
-    """Steps and digest of each episode, run one after the other."""
+    """Run the episodes one after another; return "STEPS DIGEST" by the episode's number."""
     digests = {}
     for episode in episodes:
         env = maker(episode)()
@@ -158,13 +160,16 @@ def run_alone(episodes: list[Episode]) -> dict[int, str]:
 
 
 def run_beside(episodes: list[Episode]) -> dict[int, str]:
-    """As `run_alone`, but each episode beside others of its kind in an AsyncVectorEnv."""
+    """Run up to four episodes of the same kind at once in an AsyncVectorEnv.
+
+    Returns "STEPS DIGEST" by the episode's number, like `run_alone`.
+    """
     digests: dict[int, str] = {}
     for kind in sorted({episode.kind for episode in episodes}):
         alike = [episode for episode in episodes if episode.kind == kind]
         for first in range(0, len(alike), BESIDE_EACH_OTHER):
             group = alike[first : first + BESIDE_EACH_OTHER]
-            # Their spaces differ in their limits, which the noise is part of.
+            # The observation spaces differ in their limits, which include the noise.
             vector = AsyncVectorEnv(
                 [maker(episode) for episode in group], observation_mode="different"
             )
@@ -181,7 +186,7 @@ def run_beside(episodes: list[Episode]) -> dict[int, str]:
 
 def main(episodes: int = 100, json: Path | None = None) -> None:
     planned, started = plan(episodes), time.perf_counter()
-    # Vectors first: they fork, and this process has no picture's context yet.
+    # Vectors run first, because they fork: this process must not have an OpenGL context yet.
     beside = run_beside(planned)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         forwards = pool.submit(run_alone, planned)

@@ -28,11 +28,11 @@ from benchmarks.service_load.servers import processor_s
 from tests.serve.conftest import FakeEngine, jpeg, outputs, picture
 
 CLAIM = 0.75
-TURN = 50  # requests to one server before the other has its turn
+TURN = 50  # requests to one server before the next server's turn
 
 
 def plain(engine: FakeEngine) -> Any:
-    """The handler that one writes first."""
+    """A FastAPI app whose POST /features decodes, predicts and answers, and does nothing else."""
     from fastapi import FastAPI, Request
 
     from mtlnet.inference.image_decoding.decode import crop_and_resize, decode_whole, read_header
@@ -44,7 +44,7 @@ def plain(engine: FakeEngine) -> Any:
     @app.post("/features")
     async def features(request: Request) -> dict[str, Any]:
         body = await request.body()
-        header = read_header(body)  # ours does this before its clock starts, too
+        header = read_header(body)  # before the clock starts, as in the service
         start = time.perf_counter()
         answer = decode_outputs(engine(crop_and_resize(decode_whole(body, header), camera)))
         work_ms = 1e3 * (time.perf_counter() - start)
@@ -55,7 +55,7 @@ def plain(engine: FakeEngine) -> Any:
 
 
 def serve(which: str, fd: int) -> None:
-    """Run one of the two on an inherited socket."""
+    """Serve on the inherited listening socket `fd`: the plain handler if `which` is "plain"."""
     import uvicorn
 
     engine = FakeEngine(lambda _image: outputs())
@@ -75,7 +75,8 @@ def serve(which: str, fd: int) -> None:
 
 
 class Forgetful(list[Any]):
-    """The fake engine keeps its images for the tests; here that would be a leak."""
+    """A list that stores nothing. The fake engine appends each image to its list; in this long run
+    the images would fill the memory."""
 
     def append(self, _item: Any) -> None:
         pass
@@ -83,7 +84,7 @@ class Forgetful(list[Any]):
 
 @dataclass(frozen=True)
 class Asked:
-    """Times of requests, ms: at the client, and what is no overhead of it."""
+    """Times of requests in ms: `total` at the client, and `work` (decoding and inference)."""
 
     total: list[float]
     work: list[float]
@@ -98,14 +99,17 @@ class Asked:
 
 
 def connect(address: tuple[str, int]) -> socket.socket:
-    """A connection that waits for nothing."""
+    """Open a TCP connection that sends small packets at once (TCP_NODELAY)."""
     connection = socket.create_connection(address)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
 
 
 def exchange(connection: socket.socket, request: bytes) -> bytes:
-    """The body of the answer; as little work of its own as a client can have."""
+    """Send a whole HTTP request and return the body of the answer, with little work of its own.
+
+    Raises RuntimeError if the status is not 200, ConnectionError if the server closes.
+    """
     connection.sendall(request)
     received = b""
     while b"\r\n\r\n" not in received:
@@ -127,7 +131,7 @@ def _receive(connection: socket.socket) -> bytes:
 
 
 class Asker:
-    """One connection, and the times of requests over it."""
+    """Sends the same POST /features again and again over one connection and times it."""
 
     def __init__(self, address: tuple[str, int], body: bytes) -> None:
         self._socket = connect(address)
@@ -138,7 +142,7 @@ class Asker:
         self._request = head.encode() + body
 
     def ask(self) -> tuple[float, float]:
-        """(time of the request, the work in it), ms."""
+        """Send one request; return its time and the decoding and inference time in it, in ms."""
         start = time.perf_counter()
         content = exchange(self._socket, self._request)
         total_ms = 1e3 * (time.perf_counter() - start)
@@ -147,7 +151,7 @@ class Asker:
 
 
 def measure(requests: int) -> dict[str, Any]:
-    """The figures of both, and their ratio."""
+    """Send `requests` requests to each server in turns; return the figures and their ratio."""
     body = jpeg(picture())
     found = {name: Asked([], []) for name in ("driverview", "plain")}
     processes, askers = [], {}
@@ -156,7 +160,7 @@ def measure(requests: int) -> dict[str, Any]:
         command = [sys.executable, __file__, "--which", name]
         command += ["--descriptor", str(listener.fileno())]
         processes.append(subprocess.Popen(command, pass_fds=(listener.fileno(),)))
-        askers[name] = Asker(listener.getsockname(), body)  # answered once the server is up
+        askers[name] = Asker(listener.getsockname(), body)  # the socket listens already
         listener.close()
     try:
         for asker in askers.values():

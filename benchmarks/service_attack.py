@@ -46,17 +46,18 @@ from trackfeatures.errors import UserError
 
 ANSWERED, SLOWER = 0.99, 3.0
 BODIES_MB, GROWTH_MB, LEFT_MB = 67.2, 60.0, 10.0
-RATE = 10.0  # requests a second of the well-behaved client
+RATE = 10.0  # requests per second of the well-behaved client
 HOLD_S = 1.0  # for which an attack keeps its connections open
 QUIET_S = 20.0
-SETTLE_S = 3.0  # after each attack at least: what it left over is cleared away
+SETTLE_S = 3.0  # least wait after each attack, in which the service frees its leftovers
 START_S = 120.0
 SPAWN = multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What a client saw for some seconds, and the most memory meanwhile."""
+    """Result of one measurement: number of requests, share that was answered, p50 and p99 of their
+    times, and the largest resident memory of the service."""
 
     requests: int
     answered: float
@@ -66,7 +67,7 @@ class Figures:
 
 
 def ask(connection: http.client.HTTPConnection, token: str) -> bool:
-    """One request; once more where the service closed the connection before it came."""
+    """Send one request, a second time if the connection failed; whether the status was 200."""
     headers = {"Content-Type": "image/jpeg", "Authorization": f"Bearer {token}"}
     for _ in range(2):
         try:
@@ -81,7 +82,7 @@ def ask(connection: http.client.HTTPConnection, token: str) -> bool:
 
 
 def behave(port: int, token: str, begun: Event, ended: Event, results: Any) -> None:
-    """Ask at a steady rate until `ended`; put (answered, time in ms) of each request."""
+    """Send RATE requests per second until `ended`; put a list of (answered, ms) into `results`."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     ask(connection, token)
     begun.set()
@@ -96,12 +97,12 @@ def behave(port: int, token: str, begun: Event, ended: Event, results: Any) -> N
 
 
 def repeat(attack: Attack, target: Target, seconds: float, begun: Event) -> None:
-    """Make round after round of an attack."""
+    """Repeat an attack for `seconds`; set `begun` before the first time."""
     begun.set()
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
         held = []
-        with suppress(OSError, AssertionError):  # it is kept out: as it should be
+        with suppress(OSError, AssertionError):  # the service refused it, which is correct
             held = attack(target)
         time.sleep(HOLD_S)
         for connection in held:
@@ -109,7 +110,7 @@ def repeat(attack: Attack, target: Target, seconds: float, begun: Event) -> None
 
 
 def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> Figures:
-    """The figures of a well-behaved client beside an attack; None: a quiet service."""
+    """Run the well-behaved client for `seconds`, with `attack` unless it is None."""
     begun, attacked, ended = SPAWN.Event(), SPAWN.Event(), SPAWN.Event()
     results, attacker = SPAWN.Queue(), None
     arguments = (target.port, target.token or "", begun, ended, results)
@@ -137,7 +138,7 @@ def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> 
 
 
 def memory_mb(pid: int) -> float:
-    """The resident memory of a process and of all below it, MB."""
+    """Resident memory of a process and all its descendants in MB."""
     total = 0.0
     for found in (pid, *descendants(pid)):
         with suppress(OSError):
@@ -147,7 +148,7 @@ def memory_mb(pid: int) -> float:
 
 @contextmanager
 def own_service(model: str) -> Iterator[tuple[Target, int]]:
-    """A service with one worker and a new token: its address, and its process id."""
+    """Start a service with one worker and a new token; yield its address and its process id."""
     token = secrets.token_hex(16)
     with bind("127.0.0.1", 0) as probe:
         port = probe.getsockname()[1]
@@ -172,14 +173,14 @@ def own_service(model: str) -> Iterator[tuple[Target, int]]:
 
 
 def log_lines(said: Any) -> int:
-    """How many lines the service has written."""
+    """Number of lines in the open file `said`."""
     said.seek(0)
     return int(said.read().count(b"\n"))
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Seconds for each attack, and at most after it; the attacks; whether stdout is for JSON."""
+    """Options: seconds of each attack, longest wait after it in s, attacks, JSON on stdout."""
 
     seconds: float
     settle_s: float
@@ -188,7 +189,7 @@ class Asked:
 
 
 def chosen(names: str) -> list[Attack]:
-    """The attacks with these names, or all."""
+    """The attacks with these names, separated by commas; all if empty. UserError if unknown."""
     wanted = set(names.split(",")) if names else {attack.__name__ for attack in ATTACKS}
     unknown = wanted - {attack.__name__ for attack in ATTACKS}
     if unknown:
@@ -197,8 +198,8 @@ def chosen(names: str) -> list[Attack]:
 
 
 def compare(target: Target, pid: int, asked: Asked) -> list[dict[str, Any]]:
-    """The rows of the report: a quiet service, then each attack."""
-    measure(target, pid, 5.0, None)  # its caches and pools are filled
+    """Measure the service without an attack, then with each attack; return and print the rows."""
+    measure(target, pid, 5.0, None)  # fills the caches and pools of the service
     quiet = measure(target, pid, max(QUIET_S, asked.seconds), None)
     rows: list[dict[str, Any]] = [{"attack": "none", **asdict(quiet)}]
     report(rows[0], asked.as_json)
@@ -221,7 +222,7 @@ def compare(target: Target, pid: int, asked: Asked) -> list[dict[str, Any]]:
 
 
 def settle(pid: int, limit_mb: float, at_most_s: float) -> float:
-    """Wait until the memory of a service is under a limit; the seconds that it took."""
+    """Wait until the service's memory is at most `limit_mb`; return the seconds that it took."""
     begin = time.monotonic()
     time.sleep(min(SETTLE_S, at_most_s))
     while memory_mb(pid) > limit_mb and time.monotonic() - begin < at_most_s:
@@ -230,7 +231,7 @@ def settle(pid: int, limit_mb: float, at_most_s: float) -> float:
 
 
 def report(row: dict[str, Any], as_json: bool) -> None:
-    """Print one row of the table; on stderr where stdout is for JSON."""
+    """Print one row of the table, to stderr if stdout is for JSON."""
     line = (
         f"{row['attack']:28} {100 * row['answered']:6.2f} % of {row['requests']:4d} answered, "
         f"p50 {row['p50_ms']:6.1f}, p99 {row['p99_ms']:7.1f} ms, {row['most_mb']:6.0f} MB"

@@ -30,7 +30,7 @@ VIEW = CameraParameters()
 
 
 def seeds() -> list[bytes]:
-    """Small whole images of each kind: a mutation then hits what matters, and costs little."""
+    """Undamaged JPEG and PNG files to mutate; small, so that mutations often hit the headers."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (21, 28, 3), np.uint8)
     progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
@@ -40,7 +40,7 @@ def seeds() -> list[bytes]:
 
 
 def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
-    """One damaged image."""
+    """A random one of the images `whole` with one to four random changes."""
     body = bytearray(whole[rng.integers(len(whole))])
     for _ in range(rng.integers(1, 5)):
         at, size = int(rng.integers(len(body))), int(rng.integers(1, 40))
@@ -57,13 +57,17 @@ def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
                 del body[at + 1 :]
             case 5:
                 body += whole[rng.integers(len(whole))]
-            case 6:  # numbers at their ends, where a size may stand
+            case 6:  # extreme values of two bytes, which may belong to a size
                 body[at : at + 2] = (b"\xff\xff", b"\x00\x00", b"\x7f\xff")[rng.integers(3)]
     return bytes(body)
 
 
 def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
-    """(images that gave pixels, refused, growth of memory, faults) of one part."""
+    """Decode `count` damaged images.
+
+    Returns how many gave pixels, how many were refused, the growth of memory as a share, and the
+    faults as messages.
+    """
     whole, accepted, refused, faults = seeds(), 0, 0, []
     early = 0.0
     for number in range(count):
@@ -76,7 +80,7 @@ def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[st
                 faults.append(f"part {part}, number {number}: shape {image.shape}")
         except ImageError:
             refused += 1
-        except Exception as error:  # noqa: BLE001  # just what is looked for
+        except Exception as error:  # noqa: BLE001  # the benchmark looks for any exception
             faults.append(f"part {part}, number {number}: {error!r}")
         if number == count // 10:
             early = resident_mb()
@@ -85,7 +89,7 @@ def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[st
 
 def main(count: int = 1_000_000, seed: int = 0, workers: int = os.cpu_count() or 1) -> None:
     share = count // workers
-    with ProcessPoolExecutor(workers) as pool:  # a crash breaks the pool, and is told
+    with ProcessPoolExecutor(workers) as pool:  # a crash of a worker raises BrokenProcessPool
         results = list(
             pool.map(run_part, [seed] * workers, range(workers), [share] * workers, chunksize=1)
         )

@@ -38,7 +38,7 @@ def is_ready(port: int) -> bool:
 
 
 def start_s(model: Path) -> float:
-    """Seconds from the command to ready; the service is ended after that."""
+    """Start the service, wait until it is ready, and end it; return the seconds until ready."""
     with bind("127.0.0.1", 0) as free:
         port = free.getsockname()[1]
     words = [sys.executable, "-m", "serve", "--model", str(model), "--port", str(port)]

@@ -37,12 +37,12 @@ from tests.serve.attacks.conftest import Target, resident_mb
 from tests.serve.conftest import FakeEngine, outputs
 
 MAX_GROWTH = 0.02
-HANG_S = 1.0  # of processor time for one stream
-TURNS = 8  # of the event loop for each stream
+HANG_S = 1.0  # processor time for one stream that counts as a hang
+TURNS = 8  # upper limit of the event loop's iterations after the parts of a stream
 
 
 class Transport:
-    """A transport without a socket: what it was given, and the errors of uvloop's."""
+    """A transport without a socket. It stores what is written, and raises the errors of uvloop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
@@ -74,7 +74,7 @@ class Transport:
     abort = close
 
     def lose(self) -> None:
-        """Tell the protocol that the connection has ended."""
+        """Call the protocol's `connection_lost`, once."""
         if not self.lost:
             self.closing = self.lost = True
             self.protocol.connection_lost(None)
@@ -93,7 +93,7 @@ class Transport:
 
 
 class Errors(logging.Handler):
-    """Keeps what is logged as an error."""
+    """Stores the text of each log record of level WARNING or above."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -104,7 +104,7 @@ class Errors(logging.Handler):
 
 
 def opening(rng: random.Random, known: list[bytes]) -> bytes:
-    """A stream of the grammar, or one of the tests; most are mutated."""
+    """The begin of a stream: from the grammar, or mutated from it or from the streams `known`."""
     made = [stream_grammar.message(rng) for _ in range(rng.choice([1, 1, 2]))]
     if rng.random() < 0.3:
         return b"".join(made)
@@ -118,7 +118,7 @@ def frames(rng: random.Random) -> bytes:
 
 
 async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
-    """Let a stream arrive in parts."""
+    """Give the bytes `sent` to the transport's protocol in parts of random size."""
     while sent and not transport.closing:
         for _ in range(TURNS * TURNS):  # then the client gives up
             if not transport.paused:
@@ -134,7 +134,10 @@ async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
 
 
 async def stream(make: Any, rng: random.Random, whole: list[bytes]) -> bytes:
-    """Send one mutated stream over a connection; what was answered."""
+    """Send one random stream over a new connection; return the bytes of the answers.
+
+    `make` makes the protocol; `whole` are the streams of the tests.
+    """
     transport = Transport(asyncio.get_running_loop())
     transport.protocol = make()
     transport.protocol.connection_made(transport)
@@ -151,7 +154,7 @@ async def stream(make: Any, rng: random.Random, whole: list[bytes]) -> bytes:
 
 
 async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
-    """(growth of memory, faults) of one part of the streams."""
+    """Send `count` streams; return the growth of memory as a share, and the faults as messages."""
     engine = FakeEngine(lambda _image: outputs())
     app = Service(engine, lambda _engine: None, Limits())
     config = uvicorn.Config(app, http="httptools", ws=GuardedWebSocket, log_config=None)
@@ -181,11 +184,11 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
                 faults.append(f"part {part}, number {number}: 500")
             if time.thread_time() - begin > HANG_S:
                 faults.append(f"part {part}, number {number}: {HANG_S:g} s")
-        except Exception as error:  # noqa: BLE001  # just what is looked for
+        except Exception as error:  # noqa: BLE001  # the benchmark looks for any exception
             faults.append(f"part {part}, number {number}: {error!r}")
         faults += [f"part {part}, number {number}: {said}" for said in errors.found]
         errors.found.clear()
-        engine.images.clear()  # what the service keeps is measured, not what its stand-in does
+        engine.images.clear()  # the service's memory is measured, not the fake engine's
         if number == count // 5:
             early_mb = resident_mb()
     while state.tasks:
@@ -201,7 +204,7 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
 
 
 def run_in_loop(seed: int, part: int, count: int) -> tuple[float, list[str]]:
-    """`run_part` in an event loop of its own."""
+    """Call `run_part` in a new event loop and return its result."""
     logging.getLogger("serve").setLevel(logging.ERROR)
     return asyncio.run(run_part(seed, part, count))
 
@@ -209,7 +212,7 @@ def run_in_loop(seed: int, part: int, count: int) -> tuple[float, list[str]]:
 def main(count: int = 1_000_000, seed: int = 0, workers: int = os.cpu_count() or 1) -> None:
     share, parts = count // workers, range(workers)
     begin = time.monotonic()
-    with ProcessPoolExecutor(workers) as pool:  # a crash breaks the pool, and is told
+    with ProcessPoolExecutor(workers) as pool:  # a crash of a worker raises BrokenProcessPool
         found = list(pool.map(run_in_loop, [seed] * workers, parts, [share] * workers))
     growth, faults = max(part[0] for part in found), [f for part in found for f in part[1]]
     seconds = time.monotonic() - begin

@@ -48,7 +48,10 @@ publish_untrained(pathlib.Path(sys.argv[1]), seed=3)
 
 @contextmanager
 def models(run: Path | None, trees: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
-    """The model that each source tree serves: `run`, or None: untrained weights in its format."""
+    """The folder of the model that each source tree serves.
+
+    It is a copy of `run`. If `run` is None, each tree writes untrained weights in its own format.
+    """
     if run is not None:
         with model_copy(run) as copy:
             yield dict.fromkeys(trees, copy)
@@ -62,7 +65,10 @@ def models(run: Path | None, trees: Mapping[str, Path]) -> Iterator[dict[str, Pa
 
 
 def measure(root: Path, run: Path, loader: Loader, seconds: float) -> dict[str, float]:
-    """The figures of the service of one source tree; in all of them less is better."""
+    """Start the service of the source tree `root` and return its times; less is better in all.
+
+    Times in ms except `start_s`; each of the two loads lasts `seconds`.
+    """
     begin = time.perf_counter()
     with running(OURS, Path(sys.executable), run, 1, root=root) as port:
         start_s = time.perf_counter() - begin

@@ -33,15 +33,15 @@ DRIVE_STEPS = 6000
 RESET_EVERY = 1200
 PICTURE_STEPS = 40
 WARM_UP_DRIVES = 60
-"""Each track with 1, 2 and 3 lanes, twice: the heap takes that long to find its shape."""
+"""Each track with 1, 2 and 3 lanes, twice. The heap grows until then."""
 COMPARED = 10
-"""Samples at either end whose medians are compared: the last environment is still in the memory,
-and they differ."""
+"""The medians of the first and of the last ten samples are compared, because a single sample
+depends on the environment of the last drive, which is still in memory."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Memory after a drive."""
+    """Resident memory and open file descriptors of this process after `hours` of driving."""
 
     hours: float
     resident_mib: float
@@ -49,20 +49,23 @@ class Sample:
 
 
 def resident_mib() -> float:
-    """Memory of this process that lies in RAM."""
+    """Resident memory of this process in MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def steering(info: dict[str, Any], wander: float) -> np.ndarray[Any, Any]:
-    """Steer towards `wander` m left of the middle."""
+    """Action (1,) that steers towards an offset of `wander` m left of the centre line."""
     wheel = 2.0 * info["angle"] - 0.2 * (info["to_middle"] - wander)
     return np.array([min(max(wheel, -1.0), 1.0)], np.float32)
 
 
 def drive(number: int, tracks: list[str], steps: int) -> int:
-    """One environment's life; how often it was reset."""
-    # Ten tracks and three lane counts: no two drives of thirty are alike.
+    """Make, drive and close environment `number`; return how often it was reset.
+
+    After every second drive follows a short one with pictures.
+    """
+    # Ten tracks and three lane counts: thirty drives in a row all differ.
     options: dict[str, Any] = {
         "track": tracks[number % len(tracks)],
         "lanes": 1 + number // len(tracks) % 3,
@@ -81,12 +84,12 @@ def drive(number: int, tracks: list[str], steps: int) -> int:
         )
         steps_with_resets(seen, number, PICTURE_STEPS, RESET_EVERY)
         if number % 4 == 0:
-            seen.close()  # the others are dropped, as users do
+            seen.close()  # the other ones are not closed, because users forget it, too
     return resets
 
 
 def steps_with_resets(env: gym.Env[Any, Any], seed: int, steps: int, reset_every: int) -> int:
-    """Drive `steps` steps; how many resets they took."""
+    """Drive `steps` steps with resets every `reset_every` steps; return the number of resets."""
     resets, since = 1, 0
     _, info = env.reset(seed=seed)
     for step in range(steps):
@@ -99,7 +102,7 @@ def steps_with_resets(env: gym.Env[Any, Any], seed: int, steps: int, reset_every
 
 
 def soak(hours: float) -> tuple[list[Sample], int]:
-    """Samples after each drive from the end of the warm-up on, and the number of resets."""
+    """Warm up and drive for `hours`; return a sample after each drive, and the number of resets."""
     tracks = sorted(path.stem for path in OWN_TRACKS.glob("*.toml"))
     total = round(hours * 3600 * FREQUENCY_HZ)
     for number in range(WARM_UP_DRIVES):

@@ -42,13 +42,16 @@ Policy = Callable[[dict[str, Any]], Action]
 
 
 def make(**options: Any) -> gym.Env[Any, Any]:
-    """The state environment as it is compared: the paper's state and 19 beams."""
+    """The state environment that is compared: the paper's state and 19 range beams."""
     name = "driverview/LateralControl-v0"
     return gym.make(name, track="circuit", sensors=("range",), **options)
 
 
 def steering(info: dict[str, Any]) -> Action:
-    """Keep to the middle; works on one environment's info and on a vector's."""
+    """Action that steers along the centre line, from the info of one environment or of a vector.
+
+    Its shape is (1,) or, for a vector of N, (N, 1).
+    """
     wheel = np.clip(2.0 * info["angle"] - 0.2 * info["to_middle"], -1.0, 1.0)
     return np.asarray(wheel, np.float32).reshape(*np.shape(wheel), 1)
 
@@ -59,7 +62,7 @@ def constant(*values: float) -> Policy:
 
 
 def steps_per_second(env: gym.Env[Any, Any], policy: Policy, steps: int, seed: int) -> float:
-    """Steps a second of this process's processor time, its policy's included."""
+    """Steps per second of processor time of this process; policy included, resets not."""
     _, info = env.reset(seed=seed)
     spent, started = 0.0, time.process_time()
     for _ in range(steps):
@@ -72,7 +75,7 @@ def steps_per_second(env: gym.Env[Any, Any], policy: Policy, steps: int, seed: i
 
 
 def beams_error(steps: int) -> float:
-    """Largest difference (m) between the beams observed in a drive and brute force."""
+    """Largest difference in m between range beams and brute force in a drive of `steps` steps."""
     env = make()
     unwrapped = env.unwrapped
     assert isinstance(unwrapped, simulator.env.LateralControl)
@@ -89,7 +92,7 @@ def beams_error(steps: int) -> float:
 
 
 def compare() -> dict[str, float]:
-    """Median steps a second of each environment, taking turns."""
+    """Median steps per second of processor time of each environment; they take turns."""
     contestants: dict[str, tuple[gym.Env[Any, Any], Policy, int]] = {
         f"driverview, {cars} cars": (make(traffic=cars, lanes=3), steering, STEPS["driverview"])
         for cars in (0, 6, 12)
@@ -104,7 +107,7 @@ def compare() -> dict[str, float]:
     for turn in range(TURNS + 1):
         for name, (env, policy, steps) in contestants.items():
             figure = steps_per_second(env, policy, steps if turn else steps // 10, seed=turn)
-            if turn:  # the one before the first only warms up
+            if turn:  # turn 0 is the warm-up
                 figures[name].append(figure)
         print(f"turn {turn} of {TURNS}", file=sys.stderr)
     for env, _, _ in contestants.values():
@@ -113,7 +116,7 @@ def compare() -> dict[str, float]:
 
 
 def vector_steps_per_second(mode: str) -> float:
-    """Steps a second by the clock of two environments in one vector, both counted."""
+    """Steps per second of wall time of two environments in one vector, summed over both."""
     name = "driverview/LateralControl-v0"
     vector: Any = gym.make_vec(name, 2, mode, track="circuit", sensors=("range",))
     _, info = vector.reset(seed=0)
@@ -127,9 +130,9 @@ def vector_steps_per_second(mode: str) -> float:
 
 
 def main(json: Path | None = None) -> None:
-    warnings.simplefilter("ignore")  # the peers' own
+    warnings.simplefilter("ignore")  # the peers print warnings
     cores = os.sched_getaffinity(0)
-    # Before anything is pinned: its workers take over this process's cores.
+    # Before this process is pinned to one core, because the workers inherit its cores.
     vectors = {mode: round(vector_steps_per_second(mode)) for mode in ("sync", "async")}
     os.sched_setaffinity(0, {min(cores)})
     error = beams_error(CHECKED_STEPS)

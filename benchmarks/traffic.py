@@ -21,7 +21,10 @@ from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
 
 
 def one(case: tuple[str, int, bool], seconds: float) -> dict[str, Any]:
-    """The statistics of one road, or the violation found."""
+    """Audit the traffic of one (track, lanes, ego car parked) for `seconds` of simulated time.
+
+    Returns the case with its statistics, or with the violation that was found.
+    """
     name, lanes, parked = case
     about = {"track": name, "lanes": lanes, "ego_car": "parked" if parked else "drives"}
     try:

@@ -53,9 +53,10 @@ Step = Callable[[], object]
 
 
 def ours(frames: Frames, size: int, steps: int) -> dict[str, Step]:
-    """Our step: on fresh batches (with and without changes to them), and on one in memory.
+    """Our training step: on new batches with and without augmentation, and on one in memory.
 
-    `steps` in a row are spread over a run; those called `all` are of its beginning.
+    The progress of the run goes from 0 to 1 in `steps` calls of a step, so layers freeze as in a
+    whole run. The steps named `all` stay at the start of a run, where all layers learn.
     """
     recipe = RECIPES["fast"]
     camera = CameraParameters()
@@ -77,7 +78,7 @@ def ours(frames: Frames, size: int, steps: int) -> dict[str, Step]:
 
 
 def plain(frames: Frames, size: int) -> Step:
-    """What one writes with torch alone, with the same decoder and the same network."""
+    """A plain torch training step with the same decoder and network, AdamW and a DataLoader."""
     from torch.utils.data import DataLoader
     from torch.utils.data import Dataset as TorchDataset
 
@@ -121,7 +122,10 @@ def plain(frames: Frames, size: int) -> Step:
 
 
 def measure(frames: Frames, size: int, rounds: int, steps: int) -> dict[str, Any]:
-    """Milliseconds of a step each way, `steps` at a time by turns; medians over the turns."""
+    """Time every kind of step for `rounds` turns of `steps` steps each, in turns.
+
+    Returns medians over the turns (ms), images per second and ratios.
+    """
     ways = {"plain": plain(frames, size), **ours(frames, size, steps)}
     times: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(rounds + 1):
@@ -132,7 +136,7 @@ def measure(frames: Frames, size: int, rounds: int, steps: int) -> dict[str, Any
             if number:  # the first turn warms up
                 times[name].append(1e3 * (time.perf_counter() - begin) / steps)
     median = {name: statistics.median(found) for name, found in times.items()}
-    # Neighbours in time share the machine's mood: the ratio of each turn, then their median.
+    # The machine's speed changes between turns, so the ratio is computed within each turn.
     pairs = {
         "data_to_memory": ("data", "memory"),
         "ours_to_plain": ("plain", "data"),
@@ -152,7 +156,7 @@ def measure(frames: Frames, size: int, rounds: int, steps: int) -> dict[str, Any
 
 
 def judge(frames: Frames, rounds: int, steps: int) -> dict[str, Any]:
-    """Both batches, and whether the claims hold."""
+    """Measure with batches of 32 and of the recipe's size, and compare with the claims."""
     torch.set_num_threads(CORES)
     cv2.setNumThreads(1)
     found = {size: measure(frames, size, rounds, steps) for size in (SMALL, OWN)}

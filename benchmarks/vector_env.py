@@ -40,7 +40,7 @@ TURNS = 5
 START = {"speed": 15.0}
 
 Step = Callable[[], int]
-"""Makes some control steps; returns how many car steps they were."""
+"""Makes some control steps; returns the number of car steps (control steps times cars)."""
 
 
 def cars(threads: int, sensors: tuple[str, ...]) -> LateralControlVector:
@@ -58,7 +58,10 @@ def cars(threads: int, sensors: tuple[str, ...]) -> LateralControlVector:
 
 
 def drive(vector: Any, steps: int) -> Step:
-    """Keeps the cars of a vector of ours, or those of SyncVectorEnv, in the middle."""
+    """Return a function that drives all cars of `vector` along the centre line for `steps` steps.
+
+    `vector` is a vector environment of this project or a SyncVectorEnv of single environments.
+    """
     latest = [vector.reset(seed=0)[0]]
 
     def run() -> int:
@@ -72,7 +75,7 @@ def drive(vector: Any, steps: int) -> Step:
 
 
 def constant(vector: Any, action: tuple[float, ...], steps: int) -> Step:
-    """Steps a peer's vector with one action."""
+    """Return a function that steps a vector of a peer's environment with a constant action."""
     actions = np.tile(np.array(action, np.float32), (vector.num_envs, 1))
     vector.reset(seed=0)
 
@@ -85,7 +88,7 @@ def constant(vector: Any, action: tuple[float, ...], steps: int) -> Step:
 
 
 def kernel_us(vector: LateralControlVector, steps: int) -> float:
-    """Processor time (us) of the compiled control step a car."""
+    """Processor time in us of the compiled control step, per car and step."""
     inside = vector._cars
     arguments = (inside.fleet.arrays, inside._steps, inside._outputs, inside._rules)
     started = time.process_time()
@@ -95,7 +98,7 @@ def kernel_us(vector: LateralControlVector, steps: int) -> float:
 
 
 def one_core() -> tuple[dict[str, float], float]:
-    """Median car steps a second of processor time of each contestant, and time of the kernel."""
+    """Median car steps per second of processor time of each contestant, and `kernel_us`."""
     vector = cars(1, ())
     singles = gym.make_vec(NAME, 2, vectorization_mode="sync", track="circuit", start=START)
     contestants = {
@@ -111,7 +114,7 @@ def one_core() -> tuple[dict[str, float], float]:
         for name, run in contestants.items():
             started = time.process_time()
             steps = run()
-            if turn:  # the one before the first only warms up
+            if turn:  # turn 0 is the warm-up
                 figures[name].append(steps / (time.process_time() - started))
         kernels.append(kernel_us(vector, 10))
         print(f"turn {turn} of {TURNS}", file=sys.stderr)
@@ -120,7 +123,7 @@ def one_core() -> tuple[dict[str, float], float]:
 
 
 def two_cores(sensors: tuple[str, ...]) -> float:
-    """Car steps a second by the clock, on two threads."""
+    """Median car steps per second of wall time on two threads."""
     run = drive(cars(2, sensors), 40)
     run()
     figures = []
@@ -131,7 +134,7 @@ def two_cores(sensors: tuple[str, ...]) -> float:
 
 
 def main(json: Path | None = None) -> None:
-    warnings.simplefilter("ignore")  # the peers' own
+    warnings.simplefilter("ignore")  # the peers print warnings
     available = os.sched_getaffinity(0)
     pair = {"two_cores": two_cores(()), "two_cores_beams": two_cores(("range",))}
     os.sched_setaffinity(0, {min(available)})

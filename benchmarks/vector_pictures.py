@@ -1,11 +1,13 @@
-"""Processor time of a picture in a vector environment's workers, beside a single environment.
+"""Processor time of a step with a picture: vector environment compared with single environment.
 
-Run: `python benchmarks/vector_pictures.py [--json FILE]`, about a minute on an idle core. Claim: a
-step with its picture (280 x 210) of one of eight cars, drawn by two workers, takes at most 1.15
-times the processor time that it takes in a single environment, all processes together.
+Run: `python benchmarks/vector_pictures.py [--json FILE]`; it takes about a minute on an idle core.
+In the vector environment two workers draw the pictures (280 x 210 px) of eight cars. Claim: a step
+of one car with its picture takes at most 1.15 times the processor time of a step of a single
+environment. The time of all processes is counted.
 
-Both take turns over the same stretch of road, the single environment eight times for each time of
-the vector; each process draws in one thread. A figure is the median over the turns.
+The two environments take turns on the same stretch of road. The single environment drives it eight
+times per turn, so that both make the same number of steps. Each process draws in one thread. A
+figure is the median over the turns.
 """
 
 import os
@@ -32,7 +34,7 @@ START = {"speed": 15.0}
 
 
 def processor_s(processes: list[int]) -> float:
-    """Processor time (s) that some processes have used so far."""
+    """Processor time in s that the processes with these ids have used so far, in all."""
     times = 0
     for process in processes:
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
@@ -41,7 +43,7 @@ def processor_s(processes: list[int]) -> float:
 
 
 def drive(env: Any, action: Any, times: int) -> Callable[[], None]:
-    """Drives the same stretch some times."""
+    """Return a function that drives the same STEPS steps `times` times, with a constant action."""
 
     def run() -> None:
         for _ in range(times):
@@ -74,7 +76,7 @@ def main(json: Path | None = None) -> None:
         for name, run in contestants.items():
             begin = processor_s(processes)
             run()
-            if turn:  # the one before the first only warms up
+            if turn:  # turn 0 is the warm-up
                 taken_s = processor_s(processes) - begin
                 figures[name].append(1e3 * taken_s / (CARS * (STEPS + 1)))
     vector.close()

@@ -29,7 +29,7 @@ REPEATS = 3
 
 
 def hash_files(folder: Path) -> None:
-    """Read every byte and compute SHA-256 and CRC-32: the minimum of any such check."""
+    """Read all rounds and compute their SHA-256 and CRC-32: the least work of such a check."""
 
     def one(file: Path) -> str:
         data = file.read_bytes()

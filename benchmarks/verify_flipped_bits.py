@@ -22,7 +22,7 @@ from benchmarks.claims.outcome import conclude, run_command
 from benchmarks.recordings.enlarged import collect_few
 from datagen.recording.integrity.verify import verify
 
-DERIVED = ("README.md",)  # people write into it: nothing vouches for it
+DERIVED = ("README.md",)  # people edit this file, so no hash of it is stored
 
 
 def flip(path: Path, at: int, bit: int) -> None:

@@ -29,7 +29,10 @@ PASSES = 3
 
 
 def measure(poses: int) -> dict[str, float]:
-    """Median processor time of a frame in ms by kind: of each pose the best of PASSES."""
+    """Processor time of a frame in ms by kind of light.
+
+    It is the median over the poses; the time of a pose is the shortest of PASSES.
+    """
     best: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for track in TRACKS:
         road = Road(find_track(track), 2)

@@ -17,7 +17,7 @@ def run_command(main: Callable[..., None]) -> None:
 
     The script's docstring is the help text. A UserError becomes one line on stderr.
     """
-    import typer  # here: a GPU run ends on a machine that lacks it, too
+    import typer  # imported here, because GPU runs use this module on machines without typer
 
     from runtime import cli as command
 
@@ -39,11 +39,11 @@ def conclude(figures: object, file: Path | None, reached: bool | None) -> NoRetu
 
 
 def exit_code(reached: bool) -> int:
-    """The exit code of a benchmark that measured its claim."""
+    """The exit code of a benchmark that measured its claim: 0 if it was reached, else 1."""
     return REACHED if reached else MISSED
 
 
 def not_measured(reason: str) -> NoReturn:
-    """Write why the claim was not measured and what is needed for it, and exit."""
+    """Write to stderr why the claim was not measured, and exit with code NOT_MEASURED."""
     sys.stderr.write(f"not measured: {reason}\n")
     sys.exit(NOT_MEASURED)

@@ -18,14 +18,14 @@ from benchmarks.gpu.process import Command, Ended
 from datagen.recording import Dataset, DatasetError
 
 SEEDS = {"test": 3601, "unseen": 3602, "random": 3603, "train": 3610}
-"""No model has been trained on rounds of these; the parts of `train` count on from theirs."""
+"""No model has been trained on rounds with these seeds. Part n of `train` has its seed plus n."""
 FREQUENCY_HZ = 4
 VARIED = ("--roads", "varied", "--tracks", "random")
 WORKERS_A_PART = 4
 IMAGE_BYTES = (210 - 66) * 280 * 3
-"""Of a frame in GPU memory, without the sky."""
+"""Size of a frame in GPU memory: RGB, without the sky (the upper 66 rows)."""
 MEMORY_SHARE = 0.5
-"""Of the GPU's memory for the training's frames: the loader takes 0.6 of what is free."""
+"""Share of the GPU's memory for frames. The loader uses at most 0.6 of the free memory."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Collection:
     options: tuple[str, ...]
 
     def command(self, folder: Path) -> Command:
-        """Records into `folder`/NAME."""
+        """The command that records into `folder`/NAME, with output and log beside it."""
         words = [sys.executable, "-m", "datagen", "collect", "--json"]
         words += ["--out", str(folder / self.name), "--prefix", self.name]
         words += ["--seed", str(self.seed), "--frequency", str(FREQUENCY_HZ)]
@@ -51,7 +51,7 @@ class Collection:
 
 
 def evaluation_collections(size: Size, cores: int) -> list[Collection]:
-    """`test`, `unseen` and `random`, each with its share of the cores."""
+    """The collections `test`, `unseen` and `random`; workers in proportion to their rounds."""
     rounds = {"test": size.test_rounds, "unseen": size.unseen_rounds, "random": size.random_rounds}
     options: dict[str, tuple[str, ...]] = {
         "test": ("--split-test-share", "0.8"),
@@ -66,7 +66,7 @@ def evaluation_collections(size: Size, cores: int) -> list[Collection]:
 
 
 def train_collections(size: Size, cores: int, frames: int) -> list[Collection]:
-    """The parts of `train`, `frames` frames in all, alternately on tracks and on random roads."""
+    """The parts of `train` with `frames` frames in all, alternately on tracks and random roads."""
     parts = max(2 * (cores // (2 * WORKERS_A_PART)), 2)
     rounds = max(-(-frames // (parts * size.train_frames)), 1)
     share = ("--split-test-share", "0", "--stretch", "1")
@@ -84,17 +84,21 @@ def train_collections(size: Size, cores: int, frames: int) -> list[Collection]:
 
 
 def most_frames(size: Size, gpu_bytes: int) -> int:
-    """How many frames to train on the GPU holds, at most those of `size`; without a GPU these."""
+    """Number of train frames that the GPU's memory holds, at most `size.most_train_frames`.
+
+    Without a GPU (`gpu_bytes` 0) it is `size.most_train_frames`.
+    """
     if not gpu_bytes:
         return size.most_train_frames
     return min(size.most_train_frames, int(MEMORY_SHARE * gpu_bytes / IMAGE_BYTES))
 
 
 def counted(folder: Path, collections: list[Collection], ended: list[Ended]) -> dict[str, Any]:
-    """Frames of the finished rounds by collection, and all of them a second.
+    """Frames of the finished rounds by collection, and the speed of all collections together.
 
-    `whole_frames_per_second`: with start and planning, until the last call ended;
-    `frames_per_second`: the sum of what the calls say of their recording, None if one was stopped.
+    `whole_frames_per_second` includes start and planning, until the last call ended.
+    `frames_per_second` is the sum of the recording speeds that the calls print, None if one was
+    stopped.
     """
     frames = {each.name: finished_frames(folder / each.name) for each in collections}
     seconds = max(end.seconds for end in ended)
@@ -110,7 +114,7 @@ def counted(folder: Path, collections: list[Collection], ended: list[Ended]) -> 
 
 
 def finished_frames(folder: Path) -> int:
-    """Frames of the finished rounds of a dataset, 0 where there is none."""
+    """Number of frames in the finished rounds of a dataset; 0 if `folder` is no dataset."""
     try:
         return sum(info.frames for info in Dataset.open(folder).rounds)
     except DatasetError:
@@ -118,6 +122,6 @@ def finished_frames(folder: Path) -> int:
 
 
 def _speed(folder: Path, collection: Collection) -> float:
-    """Frames a second that `datagen collect` printed."""
+    """Frames per second that `datagen collect` printed for this collection."""
     said = json.loads((folder / f"{collection.name}.json").read_text(encoding="utf-8"))
     return float(said["frames_per_second"])

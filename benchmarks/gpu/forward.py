@@ -25,7 +25,7 @@ Pass = Callable[[], Tensor]
 
 
 def passes(network: Network, images: Tensor) -> dict[str, Pass]:
-    """The ways to compute the outputs for `images` (B, 210, 280, 3) uint8."""
+    """Functions that compute the outputs (B, 9) for `images` (B, 210, 280, 3) uint8, by name."""
 
     def f32() -> Tensor:
         return network.forward_heads(network.forward_features(images))
@@ -41,7 +41,7 @@ def passes(network: Network, images: Tensor) -> dict[str, Pass]:
 
 
 def recorded(forward: Pass) -> Pass:
-    """`forward` as a CUDA graph."""
+    """Record `forward` as a CUDA graph; return a function that replays it."""
     side = torch.cuda.Stream()  # type: ignore[no-untyped-call]  # torch's
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
@@ -59,7 +59,7 @@ def recorded(forward: Pass) -> Pass:
 
 
 def median_ms(forward: Pass, device: torch.device, count: int) -> float:
-    """Median of `count` passes after as many for warming up."""
+    """Median time in ms of `count` passes, after as many passes for warming up."""
     times = []
     for _ in range(2 * count):
         begin = time.perf_counter()

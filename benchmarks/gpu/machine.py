@@ -40,9 +40,9 @@ print(json.dumps({{"tracks": len(found), "torcs": {TORCS_TRACK!r} in found}}))
 
 
 def describe_machine() -> dict[str, Any]:
-    """Processor cores, Python, torch, GPU, renderer and tracks; `errors`: what could not be asked.
+    """Processor cores, Python, torch, GPU, renderer and tracks of this machine.
 
-    The packages must be installed.
+    `errors` has a message for each question that failed. The packages must be installed.
     """
     found: dict[str, Any] = {
         "python": platform.python_version(),
@@ -68,7 +68,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def ask(question: str) -> dict[str, Any] | str:
-    """The JSON that the program `question` prints, or the last line of its error."""
+    """Run the Python program `question`; return its JSON, or the last line of its error."""
     command = [sys.executable, "-c", question]
     try:
         done = subprocess.run(
@@ -84,7 +84,10 @@ def ask(question: str) -> dict[str, Any] | str:
 
 
 def missing(found: dict[str, Any], *, gpu: bool = True) -> list[str]:
-    """What a run lacks on a machine that `describe_machine` found; `gpu`: whether it needs one."""
+    """Messages for all that the machine `found` (`describe_machine`) lacks for a run.
+
+    `gpu`: whether the run needs a GPU.
+    """
     errors: dict[str, str] = found["errors"]
     lacks = [f"{name}: {error}" for name, error in errors.items()]
     if not found["torcs"] and "tracks" not in errors:
@@ -104,7 +107,7 @@ def missing(found: dict[str, Any], *, gpu: bool = True) -> list[str]:
 
 
 def missing_at_all(*, gpu: bool = True) -> tuple[dict[str, Any], list[str]]:
-    """The description of this machine, and all that it lacks; {} where packages are missing."""
+    """The description of this machine ({} if packages are missing), and messages for its lacks."""
     packages = missing_packages()
     if packages:
         named = ", ".join(packages)
@@ -114,7 +117,7 @@ def missing_at_all(*, gpu: bool = True) -> tuple[dict[str, Any], list[str]]:
 
 
 def set_paths(site: Path, tracks: Path | None) -> None:
-    """Set what the commands of a run read from the environment: imports, tracks."""
+    """Set the environment variables PYTHONPATH and TORCS_TRACKS for the commands of a run."""
     paths = [str(ROOT), str(site), os.environ.get("PYTHONPATH", "")]
     os.environ["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
     if tracks is not None:

@@ -22,23 +22,25 @@ SECONDS = {
     "end": 5.0,
 }
 """Seconds of each stage in a run of ten minutes, in the order of the stages; runs of other lengths
-scale them. Time that a stage leaves goes to the next stages, above all to `train`, which takes all
-but the seconds of the stages after it."""
+scale them. Time that a stage does not use goes to the next stages, most of it to `train`, which
+leaves only the seconds of the stages after it."""
 STAGES = tuple(name for name in SECONDS if name not in ("check", "end"))
 LEAST_MINUTES, MOST_MINUTES = 1.0, 600.0
 
 LOADED_FRAMES_PER_SECOND = 6_000.0
-"""Least speed of reading a dataset for a training: images decoded twice, and the road ahead."""
+"""Least speed of reading a dataset for a training: images are decoded twice, and the road ahead
+is read."""
 LOAD_S, FINISH_S = 12.0, 50.0
-"""Of `train` in a run of ten minutes: its start, and the fit of the uncertainty head at its end."""
+"""Seconds of `train` in a run of ten minutes for its start, and for the fit of the uncertainty head
+at its end."""
 LEAST_TRAINED_SHARE = 0.25
-"""Share of `train` that is left to it after delays; and share of its time that is trained at least,
-if reading the data should take longer than planned."""
+"""Least share of the seconds of `train` that it gets after delays, and least share of its time for
+training steps if reading the data takes longer than planned."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The deadlines of a run of so many minutes."""
+    """The deadlines of a run of `minutes` minutes. UserError if these are too few or too many."""
 
     minutes: float
 
@@ -50,7 +52,7 @@ class Plan:
 
     @property
     def scale(self) -> float:
-        """Seconds for each of `SECONDS`."""
+        """Factor on SECONDS: the length of this run divided by their sum."""
         return 60.0 * self.minutes / sum(SECONDS.values())
 
     def deadline(self, stage: str) -> float:
@@ -59,10 +61,10 @@ class Plan:
         return self.scale * sum(SECONDS[name] for name in names[: names.index(stage) + 1])
 
     def seconds(self, stage: str, now: float) -> float:
-        """Seconds that `stage` may take when it begins at `now`, 0 when the run is over.
+        """Seconds that `stage` may take when it begins at `now` (s), 0 when the run is over.
 
-        Until its deadline. One that begins late gets its own time all the same, and `train` a
-        quarter of it: so `train` makes up for the delays before it, and `paper` for later ones.
+        A stage may take until its deadline, but at least its own seconds if it begins late. `train`
+        gets only a quarter of its own, so it makes up for earlier delays, `paper` for later ones.
         """
         share = LEAST_TRAINED_SHARE if stage == "train" else 1.0
         own = self.scale * share * SECONDS[stage]
@@ -70,7 +72,7 @@ class Plan:
         return max(min(max(self.deadline(stage) - now, own), until_end), 0.0)
 
     def train_minutes(self, now: float, frames: int) -> float:
-        """Minutes of training steps on `frames` frames when `train` begins at `now` seconds."""
+        """Minutes for training steps on `frames` frames if `train` begins at `now` (s)."""
         left = self.seconds("train", now)
         around = self.scale * (LOAD_S + FINISH_S) + frames / LOADED_FRAMES_PER_SECOND
         return max(left - around, LEAST_TRAINED_SHARE * left, 1.0) / 60.0
@@ -78,28 +80,28 @@ class Plan:
 
 @dataclass(frozen=True)
 class Size:
-    """How much a run collects, trains and times."""
+    """The amounts of data, training steps and timed passes of a run."""
 
     test_rounds: int
-    """On the tracks to train on; a fifth of them are train rounds, for the two timed recipes."""
+    """Rounds on the training tracks; a fifth are train rounds, for the two timed recipes."""
     unseen_rounds: int
     random_rounds: int
     frames: int
-    """Of each round of these three."""
+    """Frames in each round of the three datasets for evaluation."""
     train_frames: int
-    """Of each train round."""
+    """Frames in each train round."""
     most_train_frames: int
-    """In all; what the GPU's memory holds may be fewer."""
+    """Largest number of train frames in all; the GPU's memory may hold fewer."""
     timed_steps: dict[str, int]
-    """By recipe."""
+    """Steps of the timed trainings, by recipe."""
     batches: tuple[int, ...]
-    """Of the forward passes."""
+    """Batch sizes of the forward passes."""
     passes: int
     """Forward passes of each batch that are timed, after as many for warming up."""
     iterations: int | None
-    """Steps of the training; None: as many as its minutes hold."""
+    """Steps of the training; None: as many as fit into its minutes."""
     batch: int | None
-    """Images a step, unless `--batch` is given; None: the recipe's."""
+    """Batch size of the training, unless `--batch` is given; None: the recipe's."""
     device: str
 
 

@@ -10,18 +10,19 @@ from pathlib import Path
 from types import FrameType
 
 GRACE_S = 12.0
-"""After SIGTERM: a training saves a checkpoint, a collection lists its finished rounds."""
+"""From SIGTERM to SIGKILL: time for a training to save a checkpoint, or a collection its list."""
 POLL_S = 0.1
 LOG_LINES = 30
 
 
 class Interrupted(BaseException):
-    """The run got SIGTERM or SIGINT; the argument is the signal's number."""
+    """The run received SIGTERM or SIGINT; the argument is the signal's number."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """A program, and the files for its output and its log."""
+    """A program with its arguments, the files for stdout (`out`) and stderr (`log`), and
+    environment variables that are added to those of this process."""
 
     words: tuple[str, ...]
     out: Path
@@ -44,10 +45,10 @@ def run(
     enough: Callable[[], bool] = lambda: False,
     grace_s: float = GRACE_S,
 ) -> list[Ended]:
-    """Run `commands` at once for at most `seconds`, or until `enough()`.
+    """Run `commands` in parallel for at most `seconds`, or until `enough()` is true.
 
-    What still runs then gets SIGTERM and, after `grace_s`, SIGKILL, with all its processes; so does
-    everything when this process is interrupted.
+    Commands that still run then get SIGTERM and, after `grace_s`, SIGKILL with all their processes.
+    The same happens when this process is interrupted.
     """
     begin = time.monotonic()
     running = [_start(command) for command in commands]
@@ -80,7 +81,7 @@ def _start(command: Command) -> subprocess.Popen[bytes]:
 
 
 def _stop(running: Sequence[subprocess.Popen[bytes]], grace_s: float) -> None:
-    """End the processes; the children of one that has ended are left by none of our commands."""
+    """End the running processes. Processes that have ended left no children: our commands wait."""
     left = [process for process in running if process.poll() is None]
     for process in left:
         process.terminate()
@@ -101,7 +102,7 @@ def log_tail(log: Path) -> str:
 
 
 def raise_on_signals() -> None:
-    """Let SIGTERM and SIGINT raise Interrupted in the main thread; later ones change nothing."""
+    """Let the first SIGTERM or SIGINT raise Interrupted in the main thread; ignore later ones."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         for each in (signal.SIGTERM, signal.SIGINT):

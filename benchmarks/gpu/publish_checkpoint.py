@@ -24,7 +24,10 @@ PREFIX = "network."
 
 
 def publish_checkpoint(run: Path) -> int:
-    """Publish the model in the folder of its run; UserError without a checkpoint."""
+    """Publish the model of the newest checkpoint in the folder `run`; return its step number.
+
+    Raises UserError if there is no checkpoint.
+    """
     config, about = read_config(run)
     checkpoints = list_checkpoints(run)
     if not checkpoints:

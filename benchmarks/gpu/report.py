@@ -16,15 +16,15 @@ NAME = "gpu_run.json"
 FORMAT = 1
 MAX_CURVE_ROWS = 2_000
 MAX_BYTES = 16 * 2**20
-"""Of the whole output folder."""
+"""Largest size of the output folder."""
 DONE, FAILED, STOPPED, SKIPPED, RUNNING = "done", "failed", "stopped", "skipped", "running"
 
 
 class Report:
-    """The results by stage; `work`: the folder that is kept between runs, `out`: for the user."""
+    """The results by stage. `work`: folder kept between runs; `out`: folder for the user."""
 
     def __init__(self, work: Path, out: Path, rehearsal: bool) -> None:
-        """Raises UserError when `work` holds a run of another kind."""
+        """Read the results in `work`. UserError if their format or `rehearsal` differs."""
         work.mkdir(parents=True, exist_ok=True)
         out.mkdir(parents=True, exist_ok=True)
         self.work, self.out = work, out
@@ -42,34 +42,34 @@ class Report:
         return bool(self.stage(stage).get("status") == DONE)
 
     def stage(self, name: str) -> dict[str, Any]:
-        """What is known of a stage; {} before it ran."""
+        """The result of a stage; {} before it ran."""
         found: dict[str, Any] = self.content["stages"].get(name, {})
         return found
 
     def add(self, stage: str, status: str, seconds: float, found: dict[str, Any]) -> None:
-        """Write the result of a stage."""
+        """Store the result of a stage, with its status and duration, and write all results."""
         entry = {**found, "status": status, "seconds": round(seconds, 1)}
         self.content["stages"][stage] = entry
         self.save()
 
     def save(self, **changes: Any) -> None:
-        """Write all results to both folders."""
+        """Update the content with `changes` and write all results to both folders."""
         self.content.update(changes)
         for folder in (self.work, self.out):
             write_json(folder / NAME, self.content)
 
     def copy_curves(self, curves: Path, name: str) -> None:
-        """Write every n-th row of a `curves.csv`, at most `MAX_CURVE_ROWS`, as `name`."""
+        """Write every n-th row of `curves`, at most MAX_CURVE_ROWS, to the file `name` in `out`."""
         if not curves.is_file():
             return
         with curves.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
         step = -(-len(rows) // MAX_CURVE_ROWS) or 1
-        kept = rows[::-1][::step][::-1]  # the last row is among them
+        kept = rows[::-1][::step][::-1]  # includes the last row
         atomic_write(self.out / name, "".join(",".join(row) + "\n" for row in (header, *kept)))
 
     def copy_model(self, model: Path) -> None:
-        """Copy the weights and the card."""
+        """Copy the files of the folder `model` (weights and card) into `out`/model."""
         (self.out / "model").mkdir(exist_ok=True)
         for file in sorted(model.iterdir()):
             atomic_write(self.out / "model" / file.name, file.read_bytes())

@@ -31,9 +31,10 @@ def run_all(
     batch: int | None,
     commit: str,
 ) -> int:
-    """Run what is not done of all stages; the exit code. `begin`: `time.monotonic()` at the start.
+    """Run all stages that are not done, and return the exit code.
 
-    Raises UserError for minutes that hold no run, or a work folder of another kind of run.
+    `begin`: start of the run, by `time.monotonic()`. Raises UserError if `minutes` are too few or
+    too many, or if `work` has the results of another kind of run.
     """
     plan = Plan(minutes)
     report = Report(work, out, rehearse)
@@ -50,7 +51,7 @@ def run_all(
 def run_stages(task: Run, functions: Stages = STAGE_FUNCTIONS) -> None:
     """Run the stages that are not done, each until its deadline, and write the result of each.
 
-    Raises Interrupted after it has written what the interrupted stage has found.
+    Raises Interrupted after the results of the interrupted stage are written.
     """
     report = task.report
     for name in STAGES:
@@ -79,7 +80,7 @@ def run_stages(task: Run, functions: Stages = STAGE_FUNCTIONS) -> None:
 
 
 def finish(report: Report) -> int:
-    """Print what is done and what is not; the exit code."""
+    """Print status and duration of each stage; return the exit code."""
     for name in STAGES:
         stage = report.stage(name)
         why = str(stage.get("why", "")).strip().splitlines()

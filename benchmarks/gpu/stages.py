@@ -32,7 +32,7 @@ from mtlnet.inference.model_card import CARD
 MERGE_SHARE = 0.12
 """Share of the time of `collect_train` for merging its parts."""
 START_S = 12.0
-"""Until a collection records, in a run of ten minutes: imports and the plan."""
+"""Seconds for imports and planning before a collection records, in a run of ten minutes."""
 WHOLE_RUN = 150_000
 """Steps of recipe `paper`."""
 EVALUATED = {"test": "test", "unseen": "unseen", "random": "unseen"}
@@ -40,7 +40,7 @@ EVALUATED = {"test": "test", "unseen": "unseen", "random": "unseen"}
 
 
 class StageFailed(Exception):
-    """A stage did not reach its end; the argument says why. `found`: what it has found."""
+    """A stage did not finish; the argument is the reason. `found`: its results so far."""
 
     def __init__(self, why: str, found: dict[str, Any] | None = None) -> None:
         super().__init__(why)
@@ -49,7 +49,7 @@ class StageFailed(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """What all stages share; `begin`: `time.monotonic()` at the start of the run."""
+    """Settings and report of a run, for all stages; `begin`: its start, by `time.monotonic()`."""
 
     plan: Plan
     size: Size
@@ -58,7 +58,7 @@ class Run:
     recipe: str
     given_batch: int | None
     until: float = 0.0
-    """`time.monotonic()` until which the current stage may take."""
+    """Deadline of the current stage, by `time.monotonic()`."""
 
     @property
     def work(self) -> Path:
@@ -66,7 +66,7 @@ class Run:
 
     @property
     def batch(self) -> int | None:
-        """Images a step of the training; None: the recipe's."""
+        """Batch size of the training; None: the recipe's."""
         return self.given_batch or self.size.batch
 
     @property
@@ -74,18 +74,18 @@ class Run:
         return int(self.report.content["machine"]["cores"])
 
     def left(self) -> float:
-        """Seconds that are left to the current stage."""
+        """Seconds until the deadline of the current stage."""
         return self.until - time.monotonic()
 
     def command(self, name: str, *words: str, openmp_threads: int | None = None) -> Command:
-        """`python WORDS`, with output and log named after `name`."""
+        """The command `python WORDS`; its output and log are `name`.out and .log in `work`."""
         threads = {} if openmp_threads is None else {"OMP_NUM_THREADS": str(openmp_threads)}
         out, log = self.work / f"{name}.out", self.work / f"{name}.log"
         return Command((sys.executable, *words), out, log, threads)
 
 
 def forward(task: Run) -> dict[str, Any]:
-    """Milliseconds of the shipped network's forward pass by batch."""
+    """Time the shipped network's forward pass; return the times in ms for each batch size."""
     size = task.size
     command = task.command(
         "forward",
@@ -100,7 +100,7 @@ def forward(task: Run) -> dict[str, Any]:
 
 
 def compile_code(task: Run) -> dict[str, Any]:
-    """The simulator's numeric code is compiled once, before many processes need it."""
+    """Compile the simulator's numeric code once, before many processes need it."""
     command = task.command(
         "compile",
         *("-m", "datagen", "collect", "--json", "--rounds", "2", "--frames", "3"),
@@ -113,7 +113,7 @@ def compile_code(task: Run) -> dict[str, Any]:
 
 
 def gpu_tests(task: Run) -> dict[str, Any]:
-    """The tests marked `gpu`; only their files are read, for others need more packages."""
+    """Run the tests marked `gpu`. Only their files are read, because others need more packages."""
     marked = [p for p in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.gpu" in p.read_text()]
     files = [str(path.relative_to(ROOT)) for path in marked]
     command = task.command(
@@ -131,7 +131,7 @@ def gpu_tests(task: Run) -> dict[str, Any]:
 
 
 def collect_test(task: Run) -> dict[str, Any]:
-    """The three datasets to evaluate on; on a slow machine fewer rounds of them."""
+    """Collect the three datasets for evaluation; on a slow machine they get fewer rounds."""
     collections = evaluation_collections(task.size, task.cores)
     commands = [each.command(task.work) for each in collections]
     ended = run(commands, task.left())
@@ -143,9 +143,9 @@ def collect_test(task: Run) -> dict[str, Any]:
 
 
 def collect_train(task: Run) -> dict[str, Any]:
-    """The dataset to train on: as many frames as there is time for, and memory on the GPU."""
+    """Collect the dataset for the training, as large as time and GPU memory allow."""
     seconds = (1 - MERGE_SHARE) * task.left()
-    if "train_frames" not in task.report.content:  # a run that goes on keeps its plans
+    if "train_frames" not in task.report.content:  # a continued run keeps its plans
         most = most_frames(task.size, task.report.content["machine"]["gpu_bytes"])
         before = task.report.stage("collect_test")
         speed = before["frames_per_second"] or before["whole_frames_per_second"]
@@ -167,17 +167,17 @@ def collect_train(task: Run) -> dict[str, Any]:
 
 
 def time_fast(task: Run) -> dict[str, Any]:
-    """The speed of recipe `fast`."""
+    """Train with recipe `fast` and return its speed."""
     return _time_recipe(task, "fast")
 
 
 def time_paper(task: Run) -> dict[str, Any]:
-    """The time of recipe `paper`'s steps: of all 150,000 if they fit."""
+    """Train with recipe `paper` and return the time of its steps, of all 150,000 if they fit."""
     return _time_recipe(task, "paper")
 
 
 def _time_recipe(task: Run, recipe: str) -> dict[str, Any]:
-    """Times from the curves of `mtlnet train`, which is stopped after its last step."""
+    """Run `mtlnet train`, stop it after its last step, and return `timing` of its curves."""
     folder, steps = task.work / f"timed-{recipe}", task.size.timed_steps[recipe]
     resume = ("--resume",) if (folder / "config.json").is_file() else ()
     command = task.command(
@@ -202,10 +202,10 @@ def _time_recipe(task: Run, recipe: str) -> dict[str, Any]:
 
 
 def timing(points: list[dict[str, float]]) -> dict[str, Any]:
-    """Steps, seconds and speed of a training from its curves; {} without any.
+    """Steps, seconds and speed of a training from the rows of its curves; {} without rows.
 
-    `step_ms`: the median; `whole_run_s`: the seconds of 150,000 steps at the mean speed of those
-    that were taken, the first ten apart, in which the GPU's code is made ready.
+    `step_ms`: median time of a step. `whole_run_s`: time of 150,000 steps at the mean speed of the
+    steps after the first row (ten steps, in which the GPU's code is compiled), in s.
     """
     if not points:
         return {}
@@ -227,7 +227,7 @@ def timing(points: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def train(task: Run) -> dict[str, Any]:
-    """The model: `fast` from new weights, or `continue` from the shipped ones."""
+    """Train the model: recipe `fast` from new weights, or `continue` from the shipped weights."""
     folder = task.work / "train"
     points = read_curves(folder / CURVES)
     frames = sum(task.report.stage("collect_train").get("frames", {}).values())
@@ -258,7 +258,7 @@ def train(task: Run) -> dict[str, Any]:
 
 
 def ship(task: Run) -> dict[str, Any]:
-    """The model's weights in float16; of a training that was stopped, those of its checkpoint."""
+    """Ship the model with float16 weights; from the last checkpoint if training was stopped."""
     found: dict[str, Any] = {}
     folder = task.work / "train"
     if not (folder / CARD).is_file():
@@ -278,7 +278,7 @@ def ship(task: Run) -> dict[str, Any]:
 
 
 def evaluate(task: Run) -> dict[str, Any]:
-    """The reports of `mtlnet evaluate`, by torch, on what `collect_test` recorded."""
+    """Evaluate the model with torch on the datasets of `collect_test`; return the reports."""
     found: dict[str, Any] = {}
     recorded = task.report.stage("collect_test")["frames"]
     for name, split in EVALUATED.items():
@@ -317,7 +317,7 @@ NEEDS = {
     "ship": "collect_train",
     "evaluate": "ship",
 }
-"""The stage that must be done before; `ship` saves a training that was stopped."""
+"""The stage that must be done before. `ship` does not need `train`: it also ships a checkpoint."""
 
 
 def _train_set(task: Run) -> Path:
@@ -329,14 +329,14 @@ def _model(task: Run) -> Path:
 
 
 def _require_not_failed(commands: list[Command], ended: list[Ended]) -> None:
-    """Raise StageFailed where one ended by itself with an error; others may have been stopped."""
+    """Raise StageFailed if a command that was not stopped ended with an error."""
     for command, end in zip(commands, ended, strict=True):
         if not end.stopped:
             _require_ended(command, end)
 
 
 def _require_ended(command: Command, ended: Ended, found: dict[str, Any] | None = None) -> None:
-    """Raise StageFailed, with what the command wrote to its log, unless it ended well in time."""
+    """Raise StageFailed with the end of the log if the command was stopped or returned an error."""
     if ended.stopped:
         raise StageFailed(f"stopped after {ended.seconds:.0f} s; {log_tail(command.log)}", found)
     if ended.code:

@@ -18,25 +18,25 @@ PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux201
 
 
 def packages() -> dict[str, str]:
-    """All packages of `packages.toml` by the name of their import."""
+    """The packages in `packages.toml`, by import name."""
     tables = tomllib.loads(PACKAGES.read_text(encoding="utf-8"))
     return {**tables["machine"], **tables["wheels"]}
 
 
 def missing_packages() -> list[str]:
-    """The packages that cannot be imported here."""
+    """The packages of `packages.toml` that cannot be imported in this Python."""
     return [package for name, package in packages().items() if not _is_installed(name)]
 
 
 def _is_installed(name: str) -> bool:
     try:
         return find_spec(name) is not None
-    except ImportError:  # the package around it is missing
+    except ImportError:  # a parent package is missing
         return False
 
 
 def pinned() -> list[str]:
-    """The packages to bring as wheels, as `name==version` of requirements.lock."""
+    """The packages to download as wheels: `name==version`, versions from requirements.lock."""
     lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
     versions = dict(re.findall(r"^([\w.-]+)==([\w.]+)", lock, re.MULTILINE))
     wheels = tomllib.loads(PACKAGES.read_text(encoding="utf-8"))["wheels"]
@@ -44,9 +44,9 @@ def pinned() -> list[str]:
 
 
 def collect_wheels(folder: Path) -> int:
-    """Download the wheels for Python 3.12 on x86-64 into `folder`; their size in bytes.
+    """Download the wheels for Python 3.12 on x86-64 into `folder`; return their size in bytes.
 
-    Raises UserError when pip fails, or when they are larger than `MAX_BYTES`.
+    Raises UserError if pip fails, or if the wheels are larger than MAX_BYTES.
     """
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps"]
@@ -67,9 +67,9 @@ def collect_wheels(folder: Path) -> int:
 
 
 def install_wheels(wheels: Path, site: Path) -> None:
-    """Install the wheels into the folder `site`, without a network, and import from there.
+    """Install the wheels into the folder `site`, without a network, and add it to sys.path.
 
-    Raises UserError when there are none, or when pip fails.
+    Raises UserError if `wheels` has none, or if pip fails.
     """
     files = sorted(wheels.glob("*.whl"))
     if not files:
@@ -84,9 +84,10 @@ def install_wheels(wheels: Path, site: Path) -> None:
 
 
 def describe_checkout(site: Path) -> None:
-    """Make `importlib.metadata` know this checkout's version, which recorded rounds state.
+    """Write package metadata with this checkout's version into `site`.
 
-    The checkout need not be installed: it is imported from its own folder.
+    `importlib.metadata` then finds the version, which is stored in recorded rounds, although the
+    checkout is not installed.
     """
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     about = site / f"driverview-{version}.dist-info" / "METADATA"

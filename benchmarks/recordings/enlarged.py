@@ -30,7 +30,7 @@ Steps = list[dict[str, bytes]]
 
 
 def collect(folder: Path, **options: object) -> dict[str, Any]:
-    """Run `datagen collect` with these options; its result."""
+    """Run `datagen collect` with these options into `folder`; return its JSON result."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(folder)]
     for name, value in options.items():
         command += [f"--{name}", str(value)]
@@ -40,18 +40,24 @@ def collect(folder: Path, **options: object) -> dict[str, Any]:
 
 
 def collect_few(folder: Path, rounds: int, frames: int) -> Path:
-    """Collect a small training set into `folder`, and return the folder."""
+    """Collect a small training set (another scenery in every frame) into `folder`; return it."""
     collect(folder, rounds=rounds, frames=frames, seed=11, stretch=1)
     return folder
 
 
 def enlarged_few(home: Path, rounds: int, frames: int) -> Path:
-    """A dataset in `home` of `rounds` rounds, out of four collected ones of 150 frames."""
+    """Make a dataset of `rounds` x `frames` from four collected rounds of 150 frames.
+
+    Returns its folder, which is in `home`.
+    """
     return enlarge(collect_few(home / "few", 4, 150), home / "data", rounds, frames)
 
 
 def enlarge(source: Path, folder: Path, rounds: int, frames: int) -> Path:
-    """`rounds` rounds of `frames` frames each out of those in `source`; a quarter are for tests."""
+    """Write `rounds` rounds of `frames` frames from the frames of `source`; return `folder`.
+
+    A quarter of the rounds are test rounds.
+    """
     prepare(folder)
     known = [(open_round(file).header, _steps(file)) for file in round_files(source)]
     for number in range(rounds):

@@ -28,15 +28,16 @@ from trackfeatures import RoadClass, UserError
 TRACKS = ("forza", "g-track-3")
 FLYING_LAP = 2
 LIMITS = {"steps": 0.01, "score_per_step": 0.004, "mean_abs_d_m": 0.02, "max_abs_d_m": 0.15}
-"""Largest differences of the two laps: relative for the steps, absolute for the others."""
+"""Largest allowed differences of the two laps: relative for the steps, else absolute."""
 EVEN_STEPS = PHYSICS_HZ // 20
+"""Physics steps in a control step of 50 ms."""
 
 Rows = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Lap:
-    """The figures of one flying lap."""
+    """The figures of one flying lap; `d` is the offset from the centre line."""
 
     steps: int
     score_per_step: float
@@ -48,7 +49,7 @@ class Lap:
 
 @dataclass(frozen=True)
 class Fit:
-    """A flying lap in the simulator and one in TORCS."""
+    """A flying lap in the simulator (`here`) and one in TORCS on the same track."""
 
     track: str
     here: Lap
@@ -56,18 +57,21 @@ class Fit:
 
     @property
     def difference(self) -> dict[str, float]:
-        """Here minus TORCS for each of LIMITS."""
+        """The simulator's value minus TORCS's for each name in LIMITS; relative for the steps."""
         apart = {name: getattr(self.here, name) - getattr(self.torcs, name) for name in LIMITS}
         return apart | {"steps": apart["steps"] / self.torcs.steps}
 
     @property
     def within(self) -> dict[str, bool]:
-        """For each of LIMITS whether it is kept."""
+        """Whether the difference is within the limit, for each name in LIMITS."""
         return {name: abs(apart) <= LIMITS[name] for name, apart in self.difference.items()}
 
 
 def read_recording(path: Path) -> Rows:
-    """The rows of a drive in TORCS, as a structured array with the column names."""
+    """The rows of a drive in TORCS, as a structured array with the column names.
+
+    Raises UserError if the file cannot be read.
+    """
     try:
         return np.genfromtxt(path, delimiter=",", names=True, skip_header=1)
     except OSError as error:
@@ -75,9 +79,9 @@ def read_recording(path: Path) -> Rows:
 
 
 def compare(name: str, drives: Path, *, as_recorded: bool = True) -> Fit:
-    """Drive the laps of `drives`/NAME-lqr.csv again and compare the flying laps.
+    """Drive the laps of `drives`/NAME-lqr.csv in the simulator and compare the flying laps.
 
-    With `as_recorded=False` the law acts every 50 ms instead of at the recorded times.
+    With `as_recorded=False` the control steps take 50 ms instead of the recorded times.
     """
     recording = read_recording(drives / f"{name}-lqr.csv")
     road = Road(find_track(name))
@@ -93,9 +97,10 @@ def compare(name: str, drives: Path, *, as_recorded: bool = True) -> Fit:
 
 
 def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
-    """The states at the control steps of the flying lap.
+    """Drive from offset `start_d` (m) and return the state at each control step of the flying lap.
 
-    `holds`: physics steps from one control step to the next, repeated.
+    `holds`: numbers of physics steps of the control steps, repeated from the start when used up.
+    Raises UserError if the car leaves the track.
     """
     law, states = StateFeedback(), []
     with World(road, frequency_hz=PHYSICS_HZ) as world:
@@ -116,7 +121,7 @@ def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
 
 
 def figures(lap: Rows, half_width: float) -> Lap:
-    """Figures of rows with d (m), th (rad, yaw minus tangent) and v (m/s), one a control step."""
+    """Figures of a lap; its rows are control steps: d (m), th (rad, yaw minus tangent), v (m/s)."""
     offset, speed = np.abs(lap["d"]), 3.6 * lap["v"]
     score = np.cos(lap["th"]) - np.abs(np.sin(lap["th"])) - offset / half_width
     return Lap(

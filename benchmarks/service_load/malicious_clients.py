@@ -24,7 +24,10 @@ FORK = multiprocessing.get_context("fork")
 
 @contextmanager
 def malicious_clients(port: int) -> Iterator[None]:
-    """Attack the service at a port of this machine, from the first attack to the end."""
+    """Attack the service at `port` of this machine while the context lasts.
+
+    The context begins with the first attack. Raises RuntimeError if none begins.
+    """
     begun = SPAWN.Event()
     process = SPAWN.Process(target=attack_in_turn, args=(port, begun))
     process.start()
@@ -38,7 +41,8 @@ def malicious_clients(port: int) -> Iterator[None]:
 
 
 def attack_in_turn(port: int, begun: Event) -> None:
-    """Make round after round; each attack in a process, whose end closes its connections."""
+    """Repeat all attacks; set `begun` at the first. Each attack is a process: its end closes the
+    connections."""
     target = Target(port, source=ADDRESS)
     while True:
         for attack in ATTACKS:
@@ -51,10 +55,10 @@ def attack_in_turn(port: int, begun: Event) -> None:
 
 
 def make_and_hold(attack: Attack, target: Target, parent: int) -> None:
-    """Make an attack, and keep its connections open, at most as long as the parent lives."""
+    """Make an attack and keep its connections open for a minute, or until the parent exits."""
     exit_with_parent(parent)
     held = []
-    with suppress(OSError, AssertionError):  # it is kept out: as it should be
+    with suppress(OSError, AssertionError):  # the service refused it, which is correct
         held = attack(target)
     time.sleep(ROUND_S)
     for connection in held:

@@ -14,7 +14,7 @@ from benchmarks.service_load.peer_work import Work, workers
 
 @bentoml.service(workers=workers(), traffic={"timeout": 30}, logging={"access": {"enabled": False}})
 class Features:
-    """The endpoint."""
+    """The service with POST /features, which answers a JPEG."""
 
     def __init__(self) -> None:
         self.work = Work()

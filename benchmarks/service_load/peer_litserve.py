@@ -12,7 +12,7 @@ from benchmarks.service_load.peer_work import Work, port, workers
 
 
 class Features(litserve.LitAPI):
-    """The endpoint."""
+    """The API POST /features, which answers a JPEG."""
 
     def setup(self, device: str) -> None:
         self.work = Work()

@@ -9,7 +9,7 @@ from benchmarks.service_load.peer_work import Work, port, workers
 
 
 class Features(mosec.Worker):
-    """The one stage."""
+    """The only stage: it answers a JPEG."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -23,7 +23,7 @@ class Features(mosec.Worker):
 
 
 if __name__ == "__main__":
-    # Its settings come from the command line.
+    # mosec reads its settings from the command line.
     sys.argv[1:] = ["--port", str(port()), "--address", "127.0.0.1", "--log-level", "warning"]
     server = mosec.Server()
     server.append_worker(Features, num=workers(), route="/features")

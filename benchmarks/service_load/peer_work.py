@@ -1,4 +1,4 @@
-"""Answers a JPEG in each peer with the same engine, precision and answer as in our service."""
+"""The work that each peer does for a request: engine, precision and answer are the service's."""
 
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ MODEL, WORKERS, PORT = "DRIVERVIEW_MODEL", "DRIVERVIEW_WORKERS", "DRIVERVIEW_POR
 
 
 class Work:
-    """The model of the environment's run, on one thread."""
+    """Decodes a JPEG, runs the model of the folder in $DRIVERVIEW_MODEL and returns its answer."""
 
     def __init__(self) -> None:
         self._engine = load_engine(Path(os.environ[MODEL]))
@@ -24,10 +24,10 @@ class Work:
 
 
 def workers() -> int:
-    """How many processes are to run the model."""
+    """Number of worker processes, from $DRIVERVIEW_WORKERS."""
     return int(os.environ[WORKERS])
 
 
 def port() -> int:
-    """Where to listen, on this machine alone."""
+    """Port of the server on 127.0.0.1, from $DRIVERVIEW_PORT."""
     return int(os.environ[PORT])

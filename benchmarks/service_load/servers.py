@@ -34,14 +34,14 @@ BODY = jpeg(picture())
 
 
 def request(path: str = "/features") -> bytes:
-    """One whole request with an image of the model's own camera."""
+    """The bytes of a POST request to `path` with a JPEG of the model's own camera."""
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
     return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
 
 
 @dataclass(frozen=True)
 class ComparisonOptions:
-    """Options of a benchmark that compares the service with `PEERS`: the peers and the model."""
+    """Options of a benchmark that compares the service with PEERS: interpreters and model."""
 
     litserve: Annotated[Path | None, Option(help="Python of an environment with LitServe.")] = None
     bentoml: Annotated[Path | None, Option(help="Python of an environment with BentoML.")] = None
@@ -50,14 +50,17 @@ class ComparisonOptions:
     int8: Annotated[bool, Option("--int8", help="Serve the int8 graph of the run.")] = False
 
     def pythons(self) -> dict[str, Path]:
-        """The interpreter of each server: ours, and those given for `PEERS`, in their order."""
+        """Python interpreter by server: the service first, then the given ones in PEERS' order."""
         given = {name: getattr(self, name) for name in PEERS if getattr(self, name)}
         return {OURS: Path(sys.executable), **given}
 
 
 @contextmanager
 def model_copy(run: Path | None, int8: bool = False) -> Iterator[Path]:
-    """A copy of `run`, without its int8 graph unless that is wanted; None: untrained weights."""
+    """Yield a temporary copy of the model in `run`, or of untrained weights if `run` is None.
+
+    The copy has the int8 graph of `run` only if `int8` is true.
+    """
     with tempfile.TemporaryDirectory() as folder:
         found = Path(folder) / "run"
         if run is None:
@@ -87,9 +90,10 @@ def running(
     cores: set[int] | None = None,
     root: Path = ROOT,
 ) -> Iterator[int]:
-    """The port of a server that answers; `cores`: all that it may use, `root`: its source tree.
+    """Start server `name`, wait until it answers, and yield its port; end it on exit.
 
-    SIGTERM ends this process in order from now on, and the server with it.
+    `cores`: the cores it runs on; `root`: its source tree. SIGTERM now ends this process with
+    SystemExit, so that the server is ended too. Raises RuntimeError if the server does not answer.
     """
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -121,7 +125,7 @@ def running(
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End a server in peace, by force where it does not, and whoever it leaves behind."""
+    """End a server with SIGTERM, after END_S with SIGKILL, and kill all its descendants."""
     family = descendants(process.pid)
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
@@ -133,17 +137,17 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 
 
 def processor_s(pids: list[int]) -> float:
-    """Processor time of some processes so far, s."""
+    """Processor time in s that the processes with these ids have used so far, in all."""
     stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
     ticks = sum(int(fields[11]) + int(fields[12]) for fields in stats)
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def descendants(pid: int) -> list[int]:
-    """All processes below one. (Linux: the children of its first thread.)"""
+    """Ids of all descendants of a process. (Linux: of the children of its first thread.)"""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return []
     return [found for child in map(int, children) for found in (child, *descendants(child))]
 
@@ -166,7 +170,10 @@ def _answers(port: int, process: "subprocess.Popen[bytes]") -> bool:
 
 @dataclass(frozen=True)
 class Load:
-    """What became of requests: when each was due (s), its time (ms), its status; 0: it broke."""
+    """Requests (N,): when each was due (s), its time (ms), its HTTP status (0: connection failed).
+
+    `seconds`: duration of the load.
+    """
 
     due_s: NDArray[np.float64]
     time_ms: NDArray[np.float64]
@@ -174,11 +181,11 @@ class Load:
     seconds: float
 
     def per_second(self, status: int = 200) -> float:
-        """Answers of this status that came, a second."""
+        """Answers with this status per second."""
         return float((self.status == status).sum()) / self.seconds
 
     def percentile(self, percent: float, status: int = 200) -> float:
-        """Of the times of requests with this status, ms; NaN where there is none."""
+        """Percentile of the times in ms of requests with this status; NaN if there are none."""
         times = self.time_ms[self.status == status]
         return float(np.percentile(times, percent)) if len(times) else float("nan")
 
@@ -187,7 +194,7 @@ class Loader:
     """The compiled load generator."""
 
     def __init__(self, folder: Path, cores: set[int] | None = None) -> None:
-        """Compiled into `folder`; `cores`: all that it may use."""
+        """Compile it into `folder`; `cores`: the cores it runs on."""
         self._program = folder / "load"
         self._request = folder / "request"
         self._request.write_bytes(request())
@@ -196,7 +203,10 @@ class Loader:
         subprocess.run(compiler, check=True)
 
     def run(self, port: int, connections: int, seconds: float, rate: float = 0.0) -> Load:
-        """Ask for `seconds`; `rate` 0: each connection as soon as it has its answer."""
+        """Send requests for `seconds`, `rate` per second over all connections.
+
+        With rate 0 each connection sends its next request when it has received its answer.
+        """
         numbers = [str(port), str(connections), str(seconds), str(rate)]
         done = subprocess.run(
             [str(self._program), *numbers, str(self._request)],

@@ -20,7 +20,7 @@ TICK_S = 0.005
 
 
 class Slow:
-    """One of them."""
+    """One slow client; `due` is the time (s, monotonic) of its next action."""
 
     def __init__(self, number: int, port: int, start: float) -> None:
         self._begin = BEGINS[number % 2]
@@ -29,7 +29,7 @@ class Slow:
         self.due = start
 
     def act(self, events: selectors.BaseSelector, now: float) -> None:
-        """Dial, or send one more byte."""
+        """Connect and send the begin of a request, or send one more byte."""
         self.due = now + PAUSE_S
         try:
             if self._socket is None:
@@ -45,7 +45,7 @@ class Slow:
             self.leave(events, now)
 
     def hear(self, events: selectors.BaseSelector, now: float) -> None:
-        """Whatever the server says: at its end the connection is gone."""
+        """Read and ignore what the server sends; leave if it has closed the connection."""
         assert self._socket is not None
         part = b""
         with suppress(OSError):
@@ -54,7 +54,7 @@ class Slow:
             self.leave(events, now)
 
     def leave(self, events: selectors.BaseSelector, now: float) -> None:
-        """Close, and come back later."""
+        """Close the connection, to connect again after PAUSE_S."""
         if self._socket is not None:
             with suppress(KeyError):
                 events.unregister(self._socket)

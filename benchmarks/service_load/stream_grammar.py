@@ -57,7 +57,7 @@ PAYLOADS = (*CODES, b"{}", b'{"frame_id": 1}', b"[" * 300, b"\xff\xfe", b"x" * 1
 
 
 def message(rng: random.Random) -> bytes:
-    """One request, mostly right in each of its parts."""
+    """A random HTTP/1.1 request or WebSocket handshake; each of its parts is usually valid."""
     method = METHODS[0] if rng.random() < 0.5 else rng.choice(METHODS)
     version = VERSIONS[0] if rng.random() < 0.8 else rng.choice(VERSIONS)
     fields, body = [(b"Host", mostly(rng, HOSTS))], b""
@@ -76,7 +76,7 @@ def message(rng: random.Random) -> bytes:
 
 
 def payload(rng: random.Random) -> tuple[list[tuple[bytes, bytes]], bytes]:
-    """The fields that say how long a body is, and the body."""
+    """A random body and its Content-Length or Transfer-Encoding fields, sometimes wrong."""
     body = rng.choice(BODIES)
     length = (b"Content-Length", b"%d" % len(body) if rng.random() < 0.7 else rng.choice(SIZES))
     kind = rng.random()
@@ -87,7 +87,7 @@ def payload(rng: random.Random) -> tuple[list[tuple[bytes, bytes]], bytes]:
 
 
 def chunked(rng: random.Random, body: bytes) -> bytes:
-    """A body in chunks, with extensions and trailers."""
+    """`body` in chunked transfer coding, with random sizes, extensions and trailers."""
     sent, at = b"", 0
     while at < len(body):
         part = body[at : at + rng.choice([1, 7, 500])]
@@ -102,7 +102,7 @@ def chunked(rng: random.Random, body: bytes) -> bytes:
 
 
 def handshake_fields(rng: random.Random) -> list[tuple[bytes, bytes]]:
-    """Those that ask for a WebSocket."""
+    """Header fields of a WebSocket handshake, usually valid and complete."""
     key = mostly(rng, (b"AAAAAAAAAAAAAAAAAAAAAA==", b"short", b"=" * 24, b"A" * 9000))
     fields = [
         (b"Connection", mostly(rng, (b"Upgrade", b"keep-alive, upgrade", b"close"))),
@@ -116,7 +116,7 @@ def handshake_fields(rng: random.Random) -> list[tuple[bytes, bytes]]:
 
 
 def frames(rng: random.Random) -> bytes:
-    """A few WebSocket frames, mostly right."""
+    """One to five random WebSocket frames, usually valid."""
     sent = b""
     for _ in range(rng.randrange(1, 6)):
         opcode = rng.choice([1, 2, 2, 0, 8, 9, 10, rng.randrange(16)])
@@ -132,10 +132,10 @@ def frames(rng: random.Random) -> bytes:
 
 
 def mostly(rng: random.Random, choices: tuple[bytes, ...]) -> bytes:
-    """The first choice, or rarely another."""
+    """The first choice with probability 0.8, else any of them."""
     return choices[0] if rng.random() < 0.8 else rng.choice(choices)
 
 
 def ending(rng: random.Random) -> bytes:
-    """The end of a line."""
+    """A line end: CR LF, rarely an invalid one."""
     return ENDS[0] if rng.random() < 0.99 else rng.choice(ENDS)

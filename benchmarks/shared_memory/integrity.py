@@ -24,7 +24,10 @@ PICTURE = 32, 24
 def flood(
     sequence: Any, shared: Any, local: Any, shared_image: Any, local_image: Any, first: int
 ) -> int:
-    """Publish messages whose words are all their own number; a pause lets a reader come between."""
+    """Publish 5,000 messages and return the next number. All words of a message are its number.
+
+    A pause after each message gives the reader a chance to read it.
+    """
     for number in range(first, first + 5000):
         local[1:] = number
         local_image[:] = number
@@ -38,7 +41,7 @@ def flood(
 def verify(
     sequence: Any, shared: Any, local: Any, shared_image: Any, local_image: Any, goal: int
 ) -> tuple[int, int, int]:
-    """Take up to `goal` messages in 10^6 looks: (whole, torn, damaged)."""
+    """Try 10^6 times to read a message, until `goal` are read; return (whole, torn, damaged)."""
     whole, torn, damaged, seen = 0, 0, 0, 0
     for _ in range(1_000_000):
         if whole + torn >= goal:
@@ -55,7 +58,7 @@ def verify(
 
 
 def segment_for_flood(name: str, picture: tuple[int, int]) -> Segment:
-    """The server's end of a link without a server."""
+    """Create and publish the segment of a link for a `picture` of (width, height) px."""
     info = INFO.__class__(
         **{**INFO.__dict__, "image_width": picture[0], "image_height": picture[1]}
     )
@@ -66,7 +69,7 @@ def segment_for_flood(name: str, picture: tuple[int, int]) -> Segment:
 
 
 def write_states(name: str) -> None:
-    """In a process of its own: state messages as fast as it can, until it is killed."""
+    """Write state messages as fast as possible until this process is killed."""
     segment = segment_for_flood(name, PICTURE)
     arrays = Sender(segment, STATE, state_image_bytes(segment))._buffer.arrays
     number = 1
@@ -75,7 +78,10 @@ def write_states(name: str) -> None:
 
 
 def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -> dict[str, float]:
-    """numba writes states with pictures, C reads them."""
+    """Count the torn messages when numba code writes states with pictures and C reads them.
+
+    `task` of the C program `hammer`: "read", or "racy" to read without the lock.
+    """
     name = fresh_name()
     writer = start(sys.executable, str(LINK), "--flood", name)
     try:
@@ -94,12 +100,12 @@ def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -
 
 
 def client_to_server(hammer: str, messages: int, patience_s: float) -> dict[str, float]:
-    """C writes commands, numba reads them."""
+    """Count the torn messages when the C program `hammer` writes commands and numba reads them."""
     name = fresh_name()
     segment = segment_for_flood(name, (0, 0))
     writer = start(hammer, "write", name)
     arrays = Receiver(segment, COMMAND)._buffer.arrays
-    verify(*arrays, 0)  # compiled before the clock runs
+    verify(*arrays, 0)  # compiles it before the time is measured
     whole, torn, damaged = 0, 0, 0
     began = time.monotonic()
     try:

@@ -1,4 +1,4 @@
-"""Kills either side of the link (SIGKILL); times how soon the other side notices, finds remains."""
+"""Kills one side of the link (SIGKILL), times the other side's reaction, finds left segments."""
 
 import random
 import signal
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     import subprocess
 
 BOUND_S = 2.0
-"""Longest time in which the other side is to know."""
+"""Longest time in s after which the other side must notice the kill."""
 
 
 class Killer:
-    """Kills one side of a running link at a random moment, and times how long the other takes."""
+    """Kills one side of a running link at a random moment and times the other side's reaction."""
 
     def __init__(self, hammer: str, seed: int) -> None:
         self._hammer = hammer
         self._random = random.Random(seed)
         self._name, self._server = start_server()
-        self._next = start_server()  # the next is made while this one is in use
+        self._next = start_server()  # starts while the first one is in use
 
     def server_under_python(self) -> float:
-        """Seconds from the server's death to ServerDied."""
+        """Kill the server of a Python client; return the seconds until ServerDied is raised."""
         with Link(self._name, wait_s=START_S) as link:
             message = link.reset(seed=1)
             killed: list[float] = []
@@ -47,7 +47,7 @@ class Killer:
                 return self._done(time.monotonic() - killed[0])
 
     def server_under_c(self) -> float:
-        """Seconds from the server's death to the C client's end."""
+        """Kill the server of a C client; return the seconds until the client has exited."""
         client = self._drive()
         time.sleep(self._moment())
         killed: list[float] = []
@@ -59,7 +59,7 @@ class Killer:
         return self._done(seconds)
 
     def client(self) -> float:
-        """Seconds from a client's death to the next one's first answer."""
+        """Kill a C client; return the seconds until a new client gets its first answer."""
         victim = self._drive()
         time.sleep(self._moment())
         victim.kill()
@@ -70,7 +70,7 @@ class Killer:
             return time.monotonic() - killed
 
     def close(self) -> list[str]:
-        """Stop what runs; names of segments left behind."""
+        """Stop both servers; return the names of segments that remain."""
         for name, server in ((self._name, self._server), self._next):
             Link(name, wait_s=START_S).quit()
             server.communicate(timeout=START_S)

@@ -12,7 +12,7 @@ from simulator.link.layout import Mode
 
 LINK = Path(__file__).parents[1] / "link.py"
 START_S = 180.0
-"""A server compiles first, where its cache is cold."""
+"""Time limit for a start; a server with an empty cache compiles its code first."""
 TRACK = "oval"
 INFO = ServerInfo("none", 1, 4.0, 1.0, 1.0, 1.0, 1.0, 0, 20, Mode.LOCK_STEP, 0, 0, 0, (0.0,) * 19)
 
