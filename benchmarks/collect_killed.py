@@ -190,7 +190,7 @@ def kill_and_resume(
         before: Finished = {}
         through = False
         while not through:
-            # After the last kill the collection is left to end.
+            # After the last kill, the collection runs to its end.
             last = count.kills >= kills
             moment = Moment(3600) if last else Moment.draw(rng, seconds, rounds, len(before))
             killed_at = collect_until(out, options, moment)

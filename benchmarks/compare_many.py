@@ -57,7 +57,7 @@ def measure(controller: str, share: float) -> dict[str, float | bool]:
     The times are in s for the whole benchmark (extrapolated) and in us per step.
     """
     tasks, whole = tasks_of(controller, share)
-    for _ in drive_many(tasks[:1]):  # compiles
+    for _ in drive_many(tasks[:1]):  # compiles the code before the time is measured
         pass
     found: dict[int, DriveResult | UserError] = {}
     started = time.process_time()

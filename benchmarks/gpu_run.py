@@ -64,18 +64,18 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--minutes", type=float, default=10.0, help="of the whole run")
+    parser.add_argument("--minutes", type=float, default=10.0, help="length of the whole run")
     parser.add_argument(
         "--out", type=Path, default=Path("build/gpu_run/out"), help="folder for the results"
     )
     parser.add_argument(
         "--work", type=Path, default=Path("build/gpu_run/work"), help="folder for everything else"
     )
-    parser.add_argument("--wheels", type=Path, help="folder of wheels of what the machine lacks")
+    parser.add_argument("--wheels", type=Path, help="folder of wheels to install first")
     parser.add_argument("--tracks", type=Path, help="folder of TORCS's tracks; else $TORCS_TRACKS")
     parser.add_argument("--recipe", choices=RECIPES, default=RECIPES[0])
-    parser.add_argument("--batch", type=int, help="images a step of the training")
-    parser.add_argument("--rehearse", action="store_true", help="on a CPU, with small numbers")
+    parser.add_argument("--batch", type=int, help="batch size of the training")
+    parser.add_argument("--rehearse", action="store_true", help="run on a CPU, with little data")
     parser.add_argument(
         "--collect-wheels", type=Path, metavar="FOLDER", help="only download the wheels"
     )

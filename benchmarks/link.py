@@ -167,7 +167,7 @@ def main(
     flood: str = "",
     echo: str = "",
 ) -> None:
-    # SIGTERM cleans up as Ctrl-C does.
+    # SIGTERM raises SystemExit, so that segments and processes are cleaned up as with Ctrl-C.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     if flood:
         write_states(flood)

@@ -142,7 +142,7 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
         "mcap_reader": mcap_reader(frames, order, 100),
     }
     for file in (folder / "rounds").glob("*.mcap"):
-        file.read_bytes()  # warm
+        file.read_bytes()  # fills the page cache
     speeds: dict[str, list[float]] = {name: [] for name in ways}
     opened = []
     for number in range(repeats + 1):

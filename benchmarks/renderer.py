@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-# Mesa draws in the calling thread, and reads this when the first context is made.
+# Mesa reads this when the first context is made; with 0 it draws in the calling thread.
 os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1", SDL_VIDEODRIVER="dummy")
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -174,7 +174,7 @@ def run_beside(episodes: list[Episode]) -> dict[int, str]:
                 [maker(episode) for episode in group], observation_mode="different"
             )
             vector.reset()
-            nothing = vector.action_space.sample()  # the episodes choose for themselves
+            nothing = vector.action_space.sample()  # ignored: the episodes choose their actions
             for _ in range(STEPS):
                 *_, infos = vector.step(nothing)
             vector.close()

@@ -160,7 +160,7 @@ def measure(requests: int) -> dict[str, Any]:
         command = [sys.executable, __file__, "--which", name]
         command += ["--descriptor", str(listener.fileno())]
         processes.append(subprocess.Popen(command, pass_fds=(listener.fileno(),)))
-        askers[name] = Asker(listener.getsockname(), body)  # the socket listens already
+        askers[name] = Asker(listener.getsockname(), body)  # connects: the socket already listens
         listener.close()
     try:
         for asker in askers.values():

@@ -120,7 +120,7 @@ def frames(rng: random.Random) -> bytes:
 async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
     """Give the bytes `sent` to the transport's protocol in parts of random size."""
     while sent and not transport.closing:
-        for _ in range(TURNS * TURNS):  # then the client gives up
+        for _ in range(TURNS * TURNS):  # the client waits so many turns while reading is paused
             if not transport.paused:
                 break
             await asyncio.sleep(0)

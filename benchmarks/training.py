@@ -180,7 +180,7 @@ def main(data: Path | None = None, quick: bool = False, json: Path | None = None
     with tempfile.TemporaryDirectory() as home:
         data = data or collect_few(Path(home) / "few", rounds=4, frames=300)
         frames = Dataset.open(data).select("train")
-        result = judge(frames, *((3, 4) if quick else (7, 8)))  # turns, steps of each
+        result = judge(frames, *((3, 4) if quick else (7, 8)))  # turns, steps per turn
     conclude(result, json, all(result["reached"].values()))
 
 

@@ -32,7 +32,7 @@ def flood(
         local[1:] = number
         local_image[:] = number
         publish(sequence, shared, local, shared_image, local_image)
-        # Up to 4 us, of changing length so that the two sides do not keep in step.
+        # Pauses of different lengths up to 4 us, so that the two sides do not synchronise.
         spin_until_new(sequence, int(sequence[0]), number % 7 * 1000)
     return first + 5000
 

@@ -104,7 +104,7 @@ def kill(hammer: str, kills: int) -> dict[str, Any]:
     killer = Killer(hammer, seed=1)
     sides = {"client": killer.client, "server": killer.server_under_c}
     sides["server_python"] = killer.server_under_python
-    # As many servers as clients.
+    # Servers and clients are killed equally often.
     order = [("client", "server", "client", "server_python")[i % 4] for i in range(kills)]
     random.Random(2).shuffle(order)
     times: dict[str, list[float]] = {side: [] for side in sides}
