@@ -145,9 +145,11 @@ def record_plan(
     shard: "Shard | None",
     make_law: "MakeLaw | None" = None,
 ) -> "CollectResult":
-    """Record the plan, or its part `shard`, into `folder`, and show a progress bar.
+    """Record the plan, or its part `shard`, into `folder`, show a progress bar and return the
+    totals.
 
-    `classes`: forecast shares for the table above the bar. Exits with code 130 after Ctrl-C.
+    `classes` are the forecast shares of the classes of the road, for the table above the bar.
+    `make_law` creates a steering law in place of the default one. Exits with code 130 after Ctrl-C.
     """
     from datagen.execution.collect import collect as run
     from datagen.execution.progress import progress_bar
@@ -188,12 +190,13 @@ def merge(
 
 
 def names(text: str) -> tuple[str, ...]:
-    """The names in a text of names separated by commas; empty names are left out."""
+    """Split `text` at its commas into names without surrounding spaces; leave out empty names."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """The lane counts in the text of --lanes, sorted. Raises UserError for other text."""
+    """Return the lane counts in `text`, the value of --lanes, in ascending order. Raises UserError
+    if a part is no number."""
     try:
         return tuple(sorted({int(part) for part in names(text)}))
     except ValueError as error:
