@@ -1,4 +1,5 @@
-"""The scripted driver: it follows the course of its round, keeps a distance to cars and overtakes.
+"""The scripted driver: it follows a course (an offset from the track's centre for each metre
+driven), keeps a distance to the car ahead and overtakes slow cars.
 
 `simulator.driving.lateral_law` computes the steering along the course. Track frame, left positive.
 """
@@ -30,20 +31,23 @@ class SteeringLaw(Protocol):
     """Converts the driver's path into steering; `LateralLaw` is the default."""
 
     def road_curvature(self, state: CarState) -> float:
-        """Curvature (1/m) of the car's path along the road just ahead."""
+        """Return the curvature (1/m, left positive) of a path parallel to the road through the car,
+        taken where the car will be after a short preview time."""
 
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
-        """Steering action in [-1, 1], left positive, towards a path at `offset` (m from the track's
-        centre, left positive) with `curvature` (1/m) and `path_angle` (rad) to the road."""
+        """Return the steering action in [-1, 1], left positive, to follow a path at `offset` (m
+        from the track's centre, left positive) with `curvature` (1/m) and `path_angle` (rad) to the
+        road."""
 
     def restart(self) -> None:
         """Clear the state of the law, because the car was put back onto the road."""
 
 
 class ScriptedDriver:
-    """The driver of one round. It is deterministic; only its course has random values."""
+    """The driver of one round. It uses no random numbers, so the same round gets the same
+    commands."""
 
     def __init__(
         self,
@@ -54,7 +58,11 @@ class ScriptedDriver:
         *,
         law: SteeringLaw | None = None,
     ) -> None:
-        """`speed` (m/s) is kept where road and traffic allow it. `law` replaces the default law."""
+        """Drive along `course` at `speed` (m/s) where road and traffic allow it.
+
+        `frequency_hz` is the number of calls of `command` per simulated second. `law` computes the
+        steering in place of `LateralLaw`.
+        """
         car = CarParameters()
         self._road = road
         self._course = course
@@ -77,16 +85,18 @@ class ScriptedDriver:
         self._steered_for: float | None = None
 
     def offset_at(self, driven_m: float) -> float:
-        """Offset of the course in m after `driven_m` metres of the round."""
+        """Return the course's offset from the track's centre (m, left positive) after `driven_m`
+        metres of the round."""
         return self._course.at(driven_m)[0]
 
     def speed_at(self, s: float) -> float:
-        """Target speed in m/s at the position `s` (m) on the lap."""
+        """Return the target speed in m/s at the position `s` (m) on the lap."""
         return self._profile.at(s)
 
     def command(self, state: CarState, traffic: Traffic, driven_m: float) -> Command:
-        """The command for one control step. `driven_m` is the distance since the start of the
-        round; resets do not set it back."""
+        """Return steering, throttle, brake and gear for one control step. `driven_m` is the
+        distance (m) driven since the start of the round; resets of the car onto the road do not
+        reduce it."""
         if traffic.count:
             self._choose_lane(state, traffic, driven_m)
         shift_speed = self._step_shift()

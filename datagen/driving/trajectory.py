@@ -34,7 +34,8 @@ m; the paper's vehicles, which drive on their images, have 0.148 and 0.175 m."""
 
 @dataclass(frozen=True)
 class Course:
-    """A course: offset, slope and curvature (N,) at each metre; it repeats after N metres."""
+    """A course: offset (m, left positive), slope (m/m) and curvature (1/m), each (N,), at every
+    metre driven. After N metres it starts again."""
 
     offset: FloatArray  # m
     slope: FloatArray  # m per m
@@ -54,7 +55,8 @@ class Course:
 
 
 def max_offset(road: Road) -> float:
-    """Largest distance (m) of a course from the centre of the track."""
+    """Return the largest distance (m) from the centre of the track that a course on `road` may
+    have."""
     return min(
         road.lanes * road.lane_width / 2 + OUTSIDE_M,
         road.edge - EDGE_CLEARANCE_M,
@@ -63,7 +65,7 @@ def max_offset(road: Road) -> float:
 
 
 def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator) -> Course:
-    """A random course of `kind` (MIDDLE or one of TRAJECTORIES), at least `length_m` metres long.
+    """Create a random course of `kind` (MIDDLE or one of TRAJECTORIES), at least `length_m` m long.
 
     Raises UserError for another kind.
     """
