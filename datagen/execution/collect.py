@@ -49,7 +49,10 @@ class Executor(Protocol):
 
 def make_pool(executor: str, workers: int, on_message: OnMessage) -> Executor:
     """Create the executor: processes on this machine ("local") or actors on a Ray cluster ("ray").
-    `workers` 0: one per core. Raises UserError for other values."""
+
+    `workers` is their number; 0 means one per core. `on_message` receives the progress of each
+    round. Raises UserError for another executor or a negative number.
+    """
     if workers < 0:
         raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for all cores")
     if executor not in EXECUTORS:
@@ -72,12 +75,14 @@ def collect(
     shard: Shard | None = None,
     make_law: "MakeLaw | None" = None,
 ) -> CollectResult:
-    """Record the missing rounds of the plan, or of its part `shard`, into `folder`.
+    """Record the missing rounds of the plan, or of its part `shard`, into `folder`; return totals.
 
-    `make_law` makes the law that replaces the scripted driver's; the plan's `driver` names it.
+    `workers` is the number of processes, 0 for one per core. `make_law` creates a steering law for
+    each round in place of the scripted driver's; the plan's `driver` must then name it.
 
-    Raises DatasetError if the folder has other contents or rounds failed, and UserError or OSError
-    of the recording. In all cases finished rounds stay and unfinished rounds are removed.
+    Raises DatasetError if the folder has other contents or a round cannot be recorded, and
+    UserError or OSError if recording is impossible (full disk). Finished rounds always stay in
+    `folder`; files of unfinished rounds are removed.
     """
     started = time.perf_counter()
     rounds = plan.rounds if shard is None else shard.select(plan.rounds)
@@ -152,7 +157,7 @@ def _sigterm_as_interrupt() -> Iterator[None]:
 def require_matching_folder(folder: Path, plan: Plan) -> None:
     """Raise DatasetError unless `folder` is missing, empty, or a dataset of `plan`.
 
-    Raises DefinitionsMismatch for a dataset of other definitions.
+    Raises DefinitionsMismatch for a dataset recorded with another version of the label definitions.
     """
     if not folder.exists():
         return
@@ -194,7 +199,8 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
 
 
 def foreign_files(folder: Path, plan: Plan) -> list[Path]:
-    """Files in rounds/ that do not belong to the plan; readers would read them as rounds."""
+    """Return the files in rounds/ that do not belong to the plan; readers would read them as
+    rounds."""
     names = {f"{entry.id}.mcap" for entry in plan.rounds}
     return [path for path in sorted(folder.glob("rounds/*.mcap")) if path.name not in names]
 
@@ -232,7 +238,7 @@ def initialise_folder(folder: Path, plan: Plan) -> None:
 
 
 def split_of(plan: Plan, finished: set[str]) -> Split:
-    """The split of the plan, restricted to the `finished` rounds."""
+    """Return the plan's split with only the rounds whose ids are in `finished`."""
     return Split(
         **{
             side: tuple(e.id for e in plan.rounds if e.split == side and e.id in finished)

@@ -31,8 +31,8 @@ class Worker:
 
 
 class ProcessPool:
-    """Records rounds in `size` processes (0: one per core). `on_message` is called with the frames
-    done and with each finished round."""
+    """Records rounds in `size` processes (0: one per core). `on_message` is called with the number
+    of frames recorded so far in a running round, and with each finished round."""
 
     def __init__(self, size: int, on_message: OnMessage, timeouts: Timeouts | None = None) -> None:
         self._size = size or os.cpu_count() or 1

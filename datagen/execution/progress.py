@@ -23,7 +23,8 @@ from datagen.recorder.job import FramesDone, RoundDone
 
 
 class ProgressCallback(Protocol):
-    """Called with the numbers of frames and rounds that are done."""
+    """Called with the numbers of frames and rounds recorded so far, including those of earlier
+    runs."""
 
     def __call__(self, done_frames: int, done_rounds: int) -> None: ...
 
@@ -33,7 +34,8 @@ class CollectResult:
     """Result of a collection: `rounds` and `frames` in the folder, `recorded_frames` in this run.
 
     `content_hash` is the SHA-256 over all images and labels of the dataset; None while other shards
-    of the plan are missing. `resets`: how often the car was reset onto the road.
+    of the plan are missing. `resets` is the number of times that a car was reset onto the road in
+    the rounds of this run.
     """
 
     rounds: int
@@ -87,9 +89,8 @@ class CollectProgress:
 
 
 class FramesPerSecond(ProgressColumn):
-    """Column of the progress bar: frames per second, recently or, at the end, over the whole run.
-
-    Frames from earlier runs (the field `begun` of the task) do not count.
+    """Column of the progress bar: frames per second, over the last 20 s or, at the end, over the
+    whole run. Frames from earlier runs (the field `begun` of the task) do not count.
     """
 
     def render(self, task: Task) -> Text:
@@ -103,7 +104,8 @@ class FramesPerSecond(ProgressColumn):
 def progress_bar(
     rounds: int, frames: int, heading: RenderableType = ""
 ) -> Iterator[ProgressCallback]:
-    """Show a bar on stderr, below `heading`, for the duration of the block.
+    """Show a bar on stderr, below `heading`, for a collection of `rounds` rounds with `frames`
+    frames in total, for the duration of the block.
 
     Yields the function that updates the bar; the bar appears at the first update.
     """

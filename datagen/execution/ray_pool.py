@@ -46,7 +46,8 @@ class Recorder:
             return ending, (Path(home) / ending.state.file).read_bytes()
 
     def heartbeat(self) -> tuple[int, int]:
-        """Number of progress messages so far, and frames recorded of the current round."""
+        """Return the number of progress messages since the actor started, and the number of frames
+        recorded so far in its current round."""
         return self._heartbeats, self._frames
 
     def _report(self, message: FramesDone) -> None:
@@ -76,7 +77,7 @@ class ActorSlot:
 
 class RayPool:
     """Records rounds with `size` actors (0: one per core of the cluster). `on_message` is called
-    with the frames done and with each finished round."""
+    with the number of frames recorded so far in a running round, and with each finished round."""
 
     def __init__(self, size: int, on_message: OnMessage, timeouts: Timeouts | None = None) -> None:
         self._ray = _import_ray()

@@ -36,7 +36,8 @@ class Timeouts:
         return min(last_heartbeat + self.heartbeat_s, started + round_s)
 
     def spent(self, now: float, started: float, last_heartbeat: float) -> str:
-        """Return why a process that is past its deadline is stopped, in words."""
+        """Return in words which time limit a process has exceeded. The times are monotonic, in
+        s."""
         silent_s = now - last_heartbeat
         if silent_s >= self.heartbeat_s:
             return f"gave no sign of life for {silent_s:.0f} s"
@@ -82,8 +83,8 @@ class RetryQueue:
         return min((not_before for not_before, _ in self._waiting), default=float("inf"))
 
     def record_outcome(self, job: Job, outcome: Outcome) -> None:
-        """Handle the outcome of an attempt: pass on a finished round, schedule a failed round
-        again, or raise the error of a FatalError."""
+        """Handle the outcome of an attempt: pass a finished round to `on_message`, queue a failed
+        round again, or raise the error that stops the whole collection."""
         if isinstance(outcome, FatalError):
             raise outcome.error
         if isinstance(outcome, AttemptFailed):
@@ -93,9 +94,10 @@ class RetryQueue:
         self._on_message(outcome)
 
     def record_death(self, job: Job | None, reason: str) -> None:
-        """Count an ended process and schedule its round again.
+        """Count a recording process that ended unexpectedly and queue its round again.
 
-        Raises DatasetError after `DEATHS_IN_A_ROW` ended processes without a finished round.
+        Raises DatasetError when 12 processes (DEATHS_IN_A_ROW) have ended without a finished round
+        in between.
         """
         self._deaths += 1
         if self._deaths >= DEATHS_IN_A_ROW:
@@ -107,7 +109,8 @@ class RetryQueue:
             self.record_failure(job, reason, monotonic())
 
     def record_failure(self, job: Job, reason: str, now: float, final: bool = False) -> None:
-        """Schedule another attempt, or give up after `ATTEMPTS` or when `final`."""
+        """Queue the round for another attempt after a delay, or add it to `failures` if it was the
+        third attempt (ATTEMPTS) or `final` is true. `now` is in s."""
         self._on_message(FramesDone(job.plan.id, 0))
         attempts = self._attempts[job.plan.id] = self._attempts.get(job.plan.id, 0) + 1
         if attempts < ATTEMPTS and not final:
