@@ -32,7 +32,8 @@ INDEX_NAME = "__index_level_0__"
 
 
 def write(folder: Path, parts: list[Side], camera: CameraParameters, progress: Progress) -> None:
-    """Write all rounds of `parts` into `folder`. Raises DatasetError for different frame rates."""
+    """Write all rounds of `parts` into `folder`, and call `progress` with the number of frames
+    written so far. Raises DatasetError if rounds have different frame rates."""
     rounds = [info for side in parts for info in side.rounds]
     tasks = sorted({_task(info) for info in rounds})
     with _DataFiles(folder) as files:

@@ -38,7 +38,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def features(camera: CameraParameters) -> dict[str, Any]:
-    """The value of `features` in meta/info.json: type, shape and names of each column."""
+    """Return the value of `features` in meta/info.json: type, shape and names of each column."""
     image = {
         "dtype": "image",
         "shape": [camera.height, camera.width, 3],
@@ -55,8 +55,11 @@ def features(camera: CameraParameters) -> dict[str, Any]:
 
 
 def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int) -> Columns:
-    """The columns of an episode by name, one row per frame, without the images. `first` is the
-    index of the episode's first frame in the dataset; `fps` gives the timestamps in s."""
+    """Return the columns of an episode by name, one row per frame, without the images.
+
+    `first` is the index of the episode's first frame in the dataset. `task` is the index of its
+    task (the trajectory) in meta/tasks.parquet. Timestamps (s) are computed from `fps`.
+    """
     rows = [_row(step) for step in steps]
     found: Columns = {
         name: np.array([[row[part] for part in parts] for row in rows], np.float32)
@@ -77,7 +80,8 @@ def _row(step: Step) -> dict[str, Any]:
 
 
 def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
-    """The rows of an episode with their encoded images, as a table for the files in data/."""
+    """Return the rows of an episode as a table for the files in data/: the columns `numbers` and
+    the encoded images. `codec` ("jpeg" or "png") sets the suffix of the image names."""
     images = pa.StructArray.from_arrays(
         [
             pa.array([bytes(step.image) for step in steps], pa.binary()),

@@ -24,8 +24,8 @@ Stats = dict[str, list[Any]]
 
 
 def column_stats(columns: Mapping[str, NDArray[Any]]) -> dict[str, Stats]:
-    """Statistics (min, max, mean, std, quantiles, count) of each column, (N,) or (N, k), as lists
-    of k values."""
+    """Return the statistics (min, max, mean, std, QUANTILES, count) of each column, (N,) or (N, k),
+    as lists of k values."""
     return {name: _stats_of_column(column) for name, column in columns.items()}
 
 
@@ -49,7 +49,8 @@ def _stats_of_values(values: NDArray[np.float64]) -> dict[str, float]:
 
 
 class Histogram:
-    """Number of pixels with each level (0 to 255) in each of the three colour channels."""
+    """`counts` (3, 256): the number of pixels of each level in each colour channel, over `images`
+    images."""
 
     def __init__(self) -> None:
         self.images = 0
@@ -57,8 +58,8 @@ class Histogram:
 
     @staticmethod
     def of(steps: Sequence[Step], camera: CameraParameters) -> "Histogram":
-        """Count the pixels in up to `MOST_IMAGES` frames of an episode. Raises ValueError for an
-        image that cannot be decoded."""
+        """Count the pixels in all frames of an episode, or in 100 frames (MOST_IMAGES) evenly
+        spread over a longer one. Raises ValueError for an image that cannot be decoded."""
         found = Histogram()
         image = np.empty((camera.height, camera.width, 3), np.uint8)
         chosen = np.linspace(0, len(steps) - 1, min(len(steps), MOST_IMAGES)).astype(int)

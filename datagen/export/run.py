@@ -55,7 +55,8 @@ class ExportResult:
 
 
 def export(folder: Path, out: Path, config: ExportConfig, progress: Progress) -> ExportResult:
-    """Export the dataset `folder` to the new folder `out`; `progress` gets the frames written.
+    """Export the dataset `folder` to the new folder `out`. `progress` is called with the number of
+    frames written so far.
 
     Raises UserError (DatasetError) or OSError; `out` then does not exist.
     """

@@ -28,7 +28,11 @@ SHUFFLE_SEED = 0
 def write(
     folder: Path, parts: list[Side], shard_size: int, shuffle: bool, progress: Progress
 ) -> None:
-    """Write the shards of all sides, `shard_size` frames each, into `folder`."""
+    """Write the shards of all sides, `shard_size` frames each, into `folder`.
+
+    With `shuffle` the frames of a side are in a fixed random order. `progress` is called with the
+    number of frames written so far.
+    """
     (folder / SCHEMA_FILE).write_text(json.dumps(sample_schema(), indent=1) + "\n")
     done = 0
     for side in parts:
@@ -64,7 +68,7 @@ def _add_sample(shard: tarfile.TarFile, info: RoundInfo, step: Step, codec: str)
 
 
 def sample(info: RoundInfo, step: Step) -> dict[str, Any]:
-    """The content of KEY.json for a frame; absent distances are None (null)."""
+    """Return the content of KEY.json for a frame; absent distances are None (null)."""
     return {
         "round": info.id,
         "frame": step.number,
@@ -85,7 +89,8 @@ def _add(shard: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def sample_schema() -> dict[str, Any]:
-    """JSON schema of KEY.json: the schema of the recorded messages, with null for absent fields."""
+    """Return the JSON schema of KEY.json: the schema of the recorded messages, with null allowed
+    for absent fields."""
     recorded = json_schema()
     text, count = {"type": "string"}, {"type": "integer", "minimum": 0}
     parts = {
