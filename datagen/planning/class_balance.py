@@ -43,8 +43,8 @@ class Forecast(Protocol):
     """Forecasts the classes of a round's frames for several possible starts of the round."""
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
-        """Shares (N, 3) of left, straight and right frames if the round starts at `starts` (N,),
-        which are shares of the lap's length."""
+        """Return the shares (N, 3) of left, straight and right frames if the round starts at
+        `starts` (N,), which are shares of the lap's length."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class TrackForecast:
 
 
 def expected_speed(entry: RoundPlan) -> float:
-    """Expected speed of a round's car on a straight, m/s. On one lane nobody can overtake, so it is
-    at most the expected speed of the slowest other car."""
+    """Return the expected speed (m/s) of a round's car on a straight. On a one-lane road nobody can
+    overtake, so it is at most the expected speed of the slowest other car."""
     speed = entry.speed_kmh
     if entry.lanes == 1 and entry.traffic:
         low, high = DESIRED_KMH
@@ -122,7 +122,8 @@ def balance_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> tuple[Rou
 
 
 def expected_shares(rounds: Sequence[RoundPlan], forecast: Forecast) -> FloatArray:
-    """Forecast shares (3,) of left, straight and right frames, over all frames of `rounds`."""
+    """Return the forecast shares (3,) of left, straight and right frames, over all frames of
+    `rounds`."""
     each = np.array([forecast(entry, np.array([entry.start]))[0] for entry in rounds])
     return np.asarray(np.average(each, axis=0, weights=[entry.frames for entry in rounds]))
 

@@ -108,7 +108,8 @@ class CollectConfig:
     split: SplitName = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """The options by name. Options in `LATER` are left out if they have their defaults."""
+        """Return the options by name. An option that did not exist in earlier versions (key of
+        `LATER`) is left out if it has its default."""
         options = asdict(self, dict_factory=stored)
         return {k: v for k, v in options.items() if k not in LATER or v != LATER[k]}
 

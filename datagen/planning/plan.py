@@ -24,8 +24,8 @@ CONTROL_HZ = 20
 
 
 def program() -> str:
-    """Name and version of this program. A plan's hash contains them, because another version can
-    record the same round differently."""
+    """Return name and version of this program. A plan's hash contains them, because another version
+    can record the same round differently."""
     return f"driverview {version('driverview')}"
 
 
@@ -66,8 +66,8 @@ class RoundPlan:
     """The random values of a varied road; None on the paper's roads."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry as in `plan.json`. It has no key `varied` on the paper's roads, as in earlier
-        versions."""
+        """Return the entry as it is written to `plan.json`. The key `varied`, which earlier
+        versions did not have, is left out on the paper's roads."""
         entry = asdict(self, dict_factory=stored)
         if self.varied is None:
             del entry["varied"]
@@ -75,8 +75,9 @@ class RoundPlan:
 
     @property
     def steps_per_frame(self) -> int:
-        """Number of control steps from one frame to the next: the smallest one with a control rate
-        of at least `CONTROL_HZ` that divides `PHYSICS_HZ`."""
+        """Number of control steps from one frame to the next: the smallest number for which the
+        rate of control steps is at least 20 Hz (CONTROL_HZ) and divides the physics rate of 200 Hz.
+        """
         least = -(-CONTROL_HZ // self.frequency_hz)
         most = PHYSICS_HZ // self.frequency_hz
         return next(steps for steps in range(least, most + 1) if most % steps == 0)
@@ -111,7 +112,7 @@ class Plan:
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def as_json(self) -> dict[str, Any]:
-        """Content of `plan.json`. The key "wanted" holds the options."""
+        """Return the content of `plan.json`. The key "wanted" holds the options."""
         driver = {"driver": dict(self.driver)} if self.driver else {}
         return {
             "hash": self.hash,

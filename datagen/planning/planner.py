@@ -81,9 +81,10 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
 def stratified_shuffle(
     values: Sequence[Value], count: int, rng: np.random.Generator
 ) -> list[Value]:
-    """`count` values: all of `values` in random order, then all again in another order, and so on.
+    """Return `count` values: all of `values` in random order, then all of them again in another
+    random order, and so on.
 
-    Any two of `values` occur equally often, or one of them once more.
+    The numbers of occurrences of two elements of `values` differ by at most one.
     """
     shuffled: list[Value] = []
     while len(shuffled) < count:

@@ -80,7 +80,8 @@ def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) ->
 
 
 def drive_frames(track: Track, laps: float, frequency_hz: int) -> int:
-    """Number of frames in which the scripted driver drives `laps` laps from the start line.
+    """Return the number of frames in which the scripted driver drives `laps` laps from the start
+    line.
 
     The drive is simulated without images. The speed profile alone would give up to 11 % fewer
     frames, because the driver brakes for limits 0.5 s ahead and accelerates after each bend.

@@ -16,7 +16,8 @@ from simulator.track.random_roads.road import RANDOM, is_random
 
 
 def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, float]]:
-    """Forecast share of each class of the road by name, for "all" rounds and for each side."""
+    """Return the forecast share of each class of the road by name, for all rounds (key "all") and
+    for each side of the split."""
     sides = {"all": list(plan.rounds), **_sides(plan)}
     return {
         name: {
@@ -28,8 +29,8 @@ def expected_classes(plan: Plan, forecast: Forecast) -> dict[str, dict[str, floa
 
 
 def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType:
-    """Table with a column for each side of the split: number of rounds by each parameter, and the
-    forecast `classes` (the result of `expected_classes`)."""
+    """Return a table with a column for each side of the split: the number of rounds for each value
+    of a parameter, and the forecast `classes` (the result of `expected_classes`)."""
     sizes = {entry.frames for entry in plan.rounds}
     of_each = f" of {min(sizes)}" if len(sizes) == 1 else f", {sum(e.frames for e in plan.rounds)}"
     table = Table(title=f"{len(plan.rounds)} rounds{of_each} frames", box=None)
@@ -50,7 +51,7 @@ def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType
 
 
 def listing(plan: Plan) -> RenderableType:
-    """Table with a row for each round of the plan."""
+    """Return a table with a row for each round of the plan."""
     table = Table(box=None)
     names = ("round", "split", "track", "lanes", "traffic", "trajectory", "light", "km/h", "start")
     for name in names:
