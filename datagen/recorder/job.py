@@ -49,8 +49,8 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class FramesDone:
-    """Message from a recording process: number of frames recorded so far. It is also a heartbeat:
-    a process that sends none for long is stopped."""
+    """Message from a recording process: the number of frames recorded so far. It is also a
+    heartbeat: `datagen.execution.retry` sets the time after which a silent process is stopped."""
 
     round_id: str
     frames: int
@@ -106,7 +106,7 @@ def attempt(job: Job, report: Report) -> Outcome:
 
 def record_and_publish(job: Job, report: Report = lambda message: None) -> RoundDone:
     """Record one round, check the file, and move it into the dataset folder. `report` is called
-    after every `REPORT_EVERY` frames and at the end."""
+    after every 10 frames (REPORT_EVERY) and at the end."""
     # Imported here: the parent process imports this module and needs no physics or graphics.
     from datagen.recorder.record import record_round
 

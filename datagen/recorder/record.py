@@ -74,20 +74,21 @@ class RoundSimulation:
         self._start(start, self.driver.offset_at(0.0))
 
     def scenery_at(self, frame: int) -> Scenery:
-        """The scenery of frame `frame` (from 0) of the round."""
+        """Return the scenery (seed, light and look of the road) of frame `frame` (from 0) of the
+        round."""
         return self.sceneries[
             frame // (self.plan.stretch or self.plan.frames) % len(self.sceneries)
         ]
 
     def command(self) -> Command:
-        """The driver's command for the next control step."""
+        """Return the driver's command for the next control step."""
         return self.driver.command(self.state, self.world.traffic, self.driven_m)
 
     def step(self, command: Command) -> None:
         """Do one control step. If the car then has collided, is off the road or drives backwards,
         it is reset to the middle of the road.
 
-        Raises RoundFailed after too many resets.
+        Raises RoundFailed after more than 20 resets (MAX_RESETS) times the control steps per frame.
         """
         self.steps += 1
         self.speed_sum += max(self.state.speed, 0.0)
@@ -137,7 +138,11 @@ def record_round(
     progress: Callable[[int], None] = lambda frames: None,
     make_law: MakeLaw | None = None,
 ) -> None:
-    """Record the round to `path`; `progress` is called with the number of frames written."""
+    """Record the round to `path`; `progress` is called with the number of frames written so far.
+
+    `plan_hash` is stored in the file. `tracks_dir` is a further folder to search for the track.
+    `make_law` creates a steering law in place of the scripted driver's.
+    """
     with open_simulation(plan, tracks_dir, make_law) as (simulation, camera):
         road = simulation.world.road
         header = _header(plan, plan_hash, road)
@@ -157,7 +162,8 @@ def record_round(
 
 
 def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[FrameTruth]]:
-    """Simulate a round; yield its frames in batches of `BATCH_FRAMES`, without images."""
+    """Simulate a round; yield its frames, without images, in lists of 20 (BATCH_FRAMES); the last
+    list can be shorter."""
     suite = SensorSuite([s for s in STANDARD if s.name not in NOT_RECORDED])
     frames = simulation.plan.frames
     for start in range(0, frames, BATCH_FRAMES):
@@ -166,7 +172,8 @@ def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[Frame
 
 
 def scenery(plan: RoundPlan, number: int) -> Scenery:
-    """Seed, light and look of scene `number` (from 0) of a round. Each scene has its own seed."""
+    """Return the seed, the light and the look of the road (None: the paper's) of scene `number`
+    (from 0) of a round. Each scene has its own seed."""
     light = Light.named(plan.lights[number], np.random.default_rng([plan.seed, 2, number]))
     look = plan.varied.scenes[number] if plan.varied else None
     return plan.seed + number * SCENERY_SEED_STRIDE, light, look
@@ -184,7 +191,8 @@ def open_simulation(
 ) -> Iterator[tuple[RoundSimulation, Camera]]:
     """Yield the simulation of a round, at the round's start, and the camera on its car.
 
-    Raises UserError for a track that is missing or changed, and without a renderer.
+    `make_law` creates a steering law in place of the scripted driver's. Raises UserError if the
+    track is missing or changed, or if the machine cannot render.
     """
     track = _track(plan.track, tracks_dir)
     if track.content_hash != plan.track_hash:
@@ -269,8 +277,8 @@ def _readings(read: dict[str, Any]) -> SensorReadings:
 
 
 def track_lines(road: Road) -> dict[str, NDArray[np.float64]]:
-    """Markings and both edges of the asphalt along the whole lap, by name; each is (N, 3) in m in
-    the world frame."""
+    """Return the markings and both edges of the asphalt along the whole lap, by name; each is (N,
+    3) in m in the world frame."""
     count = int(np.ceil(road.track.length_m / TRACK_LINE_STEP_M))
     s = np.linspace(0.0, road.track.length_m, count + 1)
     places = {f"marking {i}": y for i, y in enumerate(road.markings_y.tolist())}

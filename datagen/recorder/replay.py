@@ -32,8 +32,9 @@ def replay(
     pixels: bool = False,
     on_replayed: OnReplayed = lambda name: None,
 ) -> tuple[list[str], list[str]]:
-    """Simulate up to `count` rounds again, spread over the plan. Returns their ids, and a line for
-    each difference from the files.
+    """Simulate up to `count` rounds again, spread over the plan. Returns the ids of these rounds,
+    and a line for each difference from the files. `on_replayed` is called with the id of each
+    round.
 
     Labels and states must be equal in every byte. With `pixels` images must be equal too; only the
     same renderer reproduces them. Raises UserError if a round cannot be simulated on this machine.
