@@ -46,7 +46,8 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name when it is first used: a command's help needs no numpy."""
+    """Import a public name when it is first used, so that the help of a command does not import
+    numpy."""
     if name not in _MODULES:
         raise AttributeError(f"module 'datagen.recording' has no attribute {name!r}")
     found = getattr(import_module(f"datagen.recording.{_MODULES[name]}"), name)

@@ -28,7 +28,7 @@ CODECS = {"jpeg": f"JPEG, quality {JPEG_QUALITY}, 4:2:0", "png": "PNG, lossless"
 
 
 def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
-    """The dataset card: Markdown with a YAML header. `statistics` is the result of
+    """Return the dataset card: Markdown with a YAML header. `statistics` is the result of
     `datagen.recording.statistics.describe`."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)

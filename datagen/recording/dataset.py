@@ -44,7 +44,7 @@ IMAGE_DATA = 2  # number of the field `data` of foxglove.CompressedImage
 class Frames:
     """The frames of some rounds, in the order of the rounds.
 
-    Labels are parsed once, images are decoded on request.
+    Labels are parsed at the first access and kept; an image is decoded at each access.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Frames:
 
     @cached_property
     def labels(self) -> Labels:
-        """The labels of these frames. Raises DatasetError if one of them is damaged."""
+        """The labels of these frames. Raises DatasetError if a label is damaged or missing."""
         if len(self) == self._first[-1]:
             return concatenate([read_labels(ix, n) for n, ix in enumerate(self._indexes)])
         places = self.places()
@@ -90,24 +90,24 @@ class Frames:
                 raise self._undecodable(i, error) from error
 
     def every(self, step: int) -> "Frames":
-        """Every `step`-th of these frames, starting with the first."""
+        """Return every `step`-th of these frames, starting with the first."""
         return Frames(self.rounds, self._indexes, self.camera, self._rows[::step])
 
     def without(self, excluded: Iterable[int]) -> "Frames":
-        """These frames except the indices `excluded`."""
+        """Return these frames except those with the indices `excluded`."""
         kept = np.delete(self._rows, list(excluded))
         return Frames(self.rounds, self._indexes, self.camera, kept)
 
     def places(self) -> NDArray[np.int64]:
-        """Position of each frame (N, 2): index of its round in `rounds`, number of the frame in
-        that round."""
+        """Return the position of each frame (N, 2): index of its round in `rounds`, number of the
+        frame in that round."""
         number = np.searchsorted(self._first, self._rows, "right") - 1
         return np.column_stack([number, self._rows - np.array(self._first)[number]])
 
     def jpeg(self, i: int) -> memoryview:
-        """The encoded image of frame `i`, not copied; a PNG if the round has that codec.
+        """Return the encoded image of frame `i`, not copied: a JPEG, or a PNG in a lossless round.
 
-        Raises IndexError, or UndecodableImage if its message is damaged.
+        Raises IndexError, or UndecodableImage if the recorded message of the image is damaged.
         """
         number, frame = self._locate(i)
         try:
@@ -116,7 +116,8 @@ class Frames:
             raise self._undecodable(i, error) from error
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """The image of frame `i`, (H, W, 3) uint8 RGB. Raises IndexError or UndecodableImage."""
+        """Decode and return the image of frame `i`, (H, W, 3) uint8 RGB. Raises IndexError or
+        UndecodableImage."""
         image: NDArray[np.uint8] = self.read_batch([i])[0]
         return image
 
@@ -214,8 +215,8 @@ class Dataset:
         return Dataset(folder, rounds, _one_camera(indexes), content_hash, indexes)
 
     def select(self, side: str = "all") -> Frames:
-        """The frames of the rounds on one side of the split (train, test, unseen), or of all rounds
-        ("all"). Raises DatasetError if there are none."""
+        """Return the frames of the rounds on one side of the split (train, test, unseen), or of all
+        rounds ("all"). Raises DatasetError if there are none."""
         if side not in (*SIDES, "all"):
             raise DatasetError(
                 f"there is no side {side!r} of a split; choose {', '.join(SIDES)} or all"
@@ -233,9 +234,9 @@ class Dataset:
 
 
 def round_files(folder: Path) -> list[Path]:
-    """The finished rounds of a dataset folder, sorted by name.
+    """Return the paths of the finished rounds of a dataset folder, sorted by name.
 
-    Raises DatasetError if there are none, or a merge has not ended.
+    Raises DatasetError if there are none, or if a merge into the folder has not ended.
     """
     require_merged(folder)
     files = sorted((folder / "rounds").glob("*.mcap"))
@@ -268,7 +269,8 @@ def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
 
 
 def dataset_hash(content_hashes: Iterable[str]) -> str:
-    """SHA-256 over the images and labels of all rounds; independent of their order and names."""
+    """Compute the SHA-256 (hex) over the content hashes of all rounds. Their order has no
+    effect."""
     digest = hashlib.sha256(tf.VERSION.encode())
     for content in sorted(content_hashes):
         digest.update(content.encode())

@@ -75,9 +75,10 @@ def prepare(folder: Path) -> None:
 
 
 def is_unstarted(folder: Path, first_file: str) -> bool:
-    """Whether `folder` holds at most empty parts of a dataset and an unfinished `first_file`.
+    """Whether `folder` holds nothing but empty subfolders of a dataset, locks and an unfinished
+    copy of `first_file`, the file that a collection writes first.
 
-    A collection leaves this if the disk was full from the start: it writes `first_file` first.
+    A collection leaves a folder in this state if the disk is full from the start.
     """
     return all(
         path.name in (unfinished_path(folder / first_file).name, LOCKS)
@@ -87,7 +88,7 @@ def is_unstarted(folder: Path, first_file: str) -> bool:
 
 
 def begin_merge(folder: Path) -> None:
-    """Mark the dataset: rounds are being added that its split does not list yet."""
+    """Mark the dataset as being merged: rounds are added that its split does not list yet."""
     atomic_write(folder / MERGING, "", fsync=True)
 
 
@@ -161,8 +162,8 @@ def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
 
 
 def read_states(folder: Path) -> dict[str, RoundState]:
-    """The states of the finished rounds by id. A round is left out if its file is missing or has
-    another size."""
+    """Read the states of the finished rounds, and return them by id. A round is left out if its
+    file is missing or has another size."""
     states = {}
     for path in sorted((folder / "state").glob("*.json")):
         state = RoundState.read(path)

@@ -88,8 +88,8 @@ def read_labels(
 
 
 def light_per_frame(index: RoundIndex) -> NDArray[np.str_]:
-    """Name of the light (N,) at each frame of a round. It is computed from the log times, because
-    frames of a recovered round can be missing."""
+    """Return the name of the light (N,) at each frame of a round. It is computed from the log
+    times, because frames of a recovered round can be missing."""
     header = index.header
     frames = steps_at(index.messages[CAMERA].log_time, header.frequency_hz)
     stretch = header.stretch or int(frames.max(initial=0)) + 1

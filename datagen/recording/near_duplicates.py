@@ -29,10 +29,10 @@ class Tolerances:
 
 @dataclass(frozen=True, slots=True)
 class NearPair:
-    """A frame and the nearest frame of the other side.
+    """A frame and the nearest frame of the other side of the split.
 
-    `distance` is the largest difference in units of its tolerance: 0 means the same pose, 1 the
-    limit.
+    `distance` is the largest of the differences, each divided by its tolerance: 0 means the same
+    pose, 1 the limit. `s_m` is the position of the first frame on the lap.
     """
 
     distance: float
@@ -46,8 +46,8 @@ class NearPair:
 
 @dataclass(frozen=True, slots=True)
 class NearDuplicates:
-    """`near` of `frames` frames have a near-duplicate on the other side. `worst`: the up to
-    `MAX_LISTED` nearest pairs."""
+    """Numbers of frames of one side: all `frames`, and those (`near`) with a near-duplicate on the
+    other side. `worst`: the nearest pairs, at most 10 (MAX_LISTED), the nearest first."""
 
     frames: int
     near: int

@@ -23,7 +23,7 @@ MAX_IMAGE_PX = 100_000_000
 
 
 def summarize_lights(lights: tuple[str, ...]) -> str:
-    """The name of the only light, or "changing" for several."""
+    """Return the name of the light if all `lights` are equal, otherwise "changing"."""
     return lights[0] if len(set(lights)) == 1 else "changing"
 
 
@@ -65,8 +65,9 @@ class RoundHeader:
     def label_camera(self) -> CameraParameters:
         """The camera that training assumes for the round's images.
 
-        On varied roads it is `camera`: training scales the labels from it to the dataset's camera.
-        With camera jitter it is the dataset's camera, as if there were no jitter.
+        A round on a varied road has its own camera height: this is `camera`, and training scales
+        the labels from it to the dataset's camera. With camera jitter this is the dataset's camera;
+        training ignores the jitter.
         """
         return self.camera if self.varied is not None else self.dataset_camera
 
@@ -199,7 +200,8 @@ class RoundInfo:
         return "random" if self.track.startswith("random:") else self.track
 
     def values_of(self, name: str) -> tuple[str, ...]:
-        """The values of attribute `name` in this round: all its lights, else one value."""
+        """Return the values of the attribute `name` in this round: the names of all its lights for
+        "light", otherwise a single value."""
         if name == "light":
             return self.lights
         return (self.track_group if name == "track" else str(getattr(self, name)),)

@@ -37,8 +37,8 @@ class SplitConfig:
 
 @dataclass(frozen=True, slots=True)
 class SplitReport:
-    """A valid split: numbers of rounds and frames by side, and near-duplicates of training frames
-    on each side. `made`: this command created the split."""
+    """A valid split: numbers of rounds and frames by side, and for each side except train its
+    frames with a near-duplicate in train. `made`: this command created the split."""
 
     path: Path
     made: bool
@@ -57,7 +57,8 @@ class SplitReport:
 
 
 def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
-    """Write a new split; rounds that are unseen in the default split stay unseen.
+    """Write a new split and return its path. Rounds that are unseen in the default split stay
+    unseen.
 
     Raises DatasetError if the name exists, there are too few rounds, or the split would leak.
     """
@@ -87,8 +88,8 @@ def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
 
 
 def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:
-    """Check a split and return its report. Raises DatasetError if a round, seed or content hash is
-    on two sides."""
+    """Check a split and return its report; `made` (this command created the split) is stored in it.
+    Raises DatasetError if a round, seed or content hash is on two sides."""
     dataset = Dataset.open(folder, name)
     frames = dataset.select("all")
     sides = np.array([info.split for info in frames.rounds])

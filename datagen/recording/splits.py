@@ -122,11 +122,12 @@ SPLIT_BY = ("round", "track")
 
 
 def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: int) -> Split:
-    """A random split of `rounds` with about `test_share` of them on the test side.
+    """Create a random split of `rounds` with about `test_share` of the rounds on the test side.
 
-    By "round", every track with enough rounds is on both sides; by "track", a track is on one side
-    only. Rounds that share a seed or a content hash stay together. Raises DatasetError for other
-    arguments, or if a side would be empty.
+    If `by` is "round", every track with enough rounds is on both sides; if it is "track", a track
+    is on one side only. Rounds that share a seed or a content hash stay together. Raises
+    DatasetError for another `by`, a share outside 0 to 1 or a negative seed, or if a side would be
+    empty.
     """
     if by not in SPLIT_BY:
         raise DatasetError(f"rounds cannot be divided by {by!r}; choose {' or '.join(SPLIT_BY)}")

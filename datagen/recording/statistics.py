@@ -14,7 +14,8 @@ from datagen.recording.names import SIDES
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:
-    """Frame counts by track, lanes, light and so on, and label statistics of each side."""
+    """Compute frame counts by track, lane count, light, traffic and trajectory, and the label
+    statistics of all frames and of each side (see `describe_labels`)."""
     frames = dataset.select("all")
     labels, rounds = frames.labels, frames.rounds
     side = np.array([info.split for info in rounds])[labels.round]
@@ -36,7 +37,7 @@ def describe(dataset: Dataset) -> dict[str, Any]:
 
 
 def describe_labels(labels: Labels) -> dict[str, Any]:
-    """Statistics of `labels`: distances in m, angles in rad, speeds in km/h.
+    """Compute statistics of `labels`: distances in m, angles in rad, speeds in km/h.
 
     `mean_deviation` is the mean absolute error of always predicting the mean; `active` is the share
     of frames in which a label is present.

@@ -1,8 +1,8 @@
 """Checks that recorded labels follow from the lateral offset recorded with them.
 
 Labels are rounded to float32. Near the limits of the in-lane and on-marking systems and of a lane,
-rounding decides which one applies. So a label is accepted if it is right for any offset within
-TOLERANCE_M of the recorded offset.
+rounding decides which system or lane applies. So a label is accepted if it is right for any offset
+within 0.1 mm (TOLERANCE_M) of the recorded offset.
 """
 
 from collections.abc import Iterator
@@ -39,7 +39,8 @@ def label_problems(
     """Yield a line for each kind of contradiction between a round's labels and the definitions.
 
     `roll` (N,) is the car's roll in rad. On a banked road it limits the lateral distance between
-    the centre of gravity and the nearest point of the road plane.
+    the centre of gravity and the nearest point of the road plane. `line_offsets` are the offsets
+    (m) of the painted lines of each marking from its nominal position; () for none.
     """
     try:
         tf.check_lanes(lanes, lane_width_m)

@@ -47,7 +47,8 @@ Step = dict[str, FoundMessage]
 
 @dataclass(frozen=True, slots=True)
 class IntactFrames:
-    """The messages of the intact frames by frame number, ascending; the track scene if found."""
+    """`steps`: the messages of each intact frame by topic, by frame number in ascending order.
+    `scene`: the message with the lines of the track; None if it is damaged."""
 
     steps: dict[int, Step]
     scene: FoundMessage | None
@@ -55,8 +56,8 @@ class IntactFrames:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """The result of `datagen recover`: numbers of saved and lost frames. With `at_least`, more can
-    be lost. The fields are the keys of `--json`."""
+    """The result of `datagen recover`: numbers of saved and lost frames. If `at_least` is true,
+    `lost` is a lower limit. The fields are the keys of `--json`."""
 
     out: str
     saved: int

@@ -56,7 +56,7 @@ def check_round(path: Path, level: str, state: RoundState | None) -> tuple[int, 
 
 
 def describe_read_error(path: Path, error: OSError) -> str:
-    """The line in a report for a file that cannot be read."""
+    """Return the line of the report for a file that the system cannot read."""
     return f"{path} cannot be read ({error.strerror})"
 
 

@@ -47,7 +47,7 @@ class Summary:
 
 
 def read_summary(view: memoryview) -> Summary:
-    """The summary of an MCAP file, checked against its CRC; empty if the file has none.
+    """Read the summary of an MCAP file and check it against its CRC; empty if the file has none.
 
     Raises ValueError if the file is no complete MCAP file or its summary is damaged.
     """

@@ -61,7 +61,7 @@ class Messages(Protocol):
         """Log times (N,) in ns: simulated time plus `topics.EPOCH_NS`."""
 
     def payload(self, i: int) -> memoryview:
-        """The serialised message number `i`.
+        """Return the bytes of the serialised message number `i` (from 0).
 
         Raises ValueError if its chunk is damaged, or the index does not point to a message.
         """

@@ -50,8 +50,9 @@ class Scan:
 
 
 def scan(path: Path, on_message: OnMessage) -> Scan:
-    """Read the file at `path` once and check it; `problems` of the result lists its damage. Raises
-    OSError if it cannot be read."""
+    """Read the file at `path` once and check it; `problems` of the result lists its damage.
+    `on_message` is called with the topic, log time (ns) and payload of each message. Raises OSError
+    if the file cannot be read."""
     with path.open("rb") as stream:
         return _Scanner(stream, path.stat().st_size, on_message).run()
 
@@ -188,7 +189,7 @@ class _Scanner:
 
 
 def decompressed(body: memoryview) -> memoryview:
-    """The decompressed messages of the chunk record `body`. Raises the errors of the official
-    library."""
+    """Decompress the messages of a chunk; `body` is the content of its record. Raises the errors of
+    the official library."""
     stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))))
     return memoryview(stream.read(length))

@@ -23,13 +23,13 @@ INTEGERS = (FieldDescriptor.CPPTYPE_INT32, FieldDescriptor.CPPTYPE_UINT32)
 
 @lru_cache(maxsize=1)
 def schema_text() -> str:
-    """The content of the schema file: the result of `json_schema` as indented JSON."""
+    """Return the content of the schema file: the result of `json_schema` as indented JSON."""
     return json.dumps(json_schema(), indent=1) + "\n"
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema as a dict: one definition per message with one property per field, and the message
-    of each topic."""
+    """Return the schema as a dict: one definition per message with one property per field, and the
+    message of each topic."""
     package = driverview_pb2.DESCRIPTOR.package
     own_types = {
         topic: kind.DESCRIPTOR.name

@@ -76,7 +76,7 @@ def calibration(camera: CameraParameters, time: Timestamp) -> bytes:
 
 
 def lens_parameters(camera: CameraParameters) -> tuple[str, list[float]]:
-    """Foxglove's name of the camera's distortion model, and its coefficients."""
+    """Return Foxglove's name of the camera's distortion model, and its coefficients."""
     if camera.distortion == "fisheye":
         return "kannala_brandt", list(camera.coefficients)
     count = 8 if len(camera.coefficients) > 5 else 5
@@ -85,8 +85,8 @@ def lens_parameters(camera: CameraParameters) -> tuple[str, list[float]]:
 
 
 def annotations(frame: Frame, time: Timestamp) -> bytes:
-    """The annotations of an image: the lane markings as polylines (pixels) and a line of text with
-    the labels."""
+    """Return the serialised annotations of an image: the lane markings as polylines (pixels) and a
+    line of text with the labels."""
     message = ImageAnnotations(timestamp=time)
     for polyline in frame.markings:
         line = message.points.add()
@@ -108,7 +108,8 @@ def annotations(frame: Frame, time: Timestamp) -> bytes:
 
 
 def caption(features: tf.TrackFeatures) -> str:
-    """The labels in one line: active distances in m, angle in rad, heading."""
+    """Return the labels in one line: distances in m that are present, angle in rad, class of the
+    road."""
     distances = " ".join(
         f"{name} {value:.2f}" for name, value in features.distances.items() if value is not None
     )
@@ -142,7 +143,8 @@ def command(given: DriverCommand) -> bytes:
 
 
 def traffic(frame: Frame, time: Timestamp) -> bytes:
-    """All cars as boxes: other cars in the world frame, the ego car in its body frame."""
+    """Return the serialised boxes of all cars: other cars in the world frame, the ego car in its
+    body frame."""
     message = SceneUpdate()
     ego = (0.0, 0.0, EGO_BOX_CENTRE_HEIGHT_M, 0.0, 0.0, 0.0)
     _add_box(message, "ego", EGO, ego, EGO_SIZE_M, BLUE, time)
@@ -153,7 +155,8 @@ def traffic(frame: Frame, time: Timestamp) -> bytes:
 
 
 def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> bytes:
-    """The scene with the named polylines `lines`, each (N, 3) in m in the world frame."""
+    """Return the serialised scene with the named polylines `lines`, each (N, 3) in m in the world
+    frame."""
     message = SceneUpdate()
     for name, points in lines.items():
         entity = message.entities.add(id=name, frame_id=WORLD)
@@ -167,7 +170,8 @@ def track_scene(lines: Mapping[str, NDArray[np.float64]], time: Timestamp) -> by
 
 
 def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> bytes:
-    """Two coordinate transforms: the car's pose in the world, and the camera's pose on the car."""
+    """Return two serialised coordinate transforms: the car's pose in the world, and the camera's
+    pose on the car."""
     message = FrameTransforms()
     _add_transform(
         message, WORLD, EGO, (ego.x, ego.y, ego.z), quaternion(ego.roll, ego.pitch, ego.yaw), time
@@ -181,7 +185,7 @@ def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> byte
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """x, y, z, w of the rotation Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return x, y, z, w of the rotation Rz(yaw) Ry(pitch) Rx(roll); angles in rad."""
     cr, sr = cos(roll / 2.0), sin(roll / 2.0)
     cp, sp = cos(pitch / 2.0), sin(pitch / 2.0)
     cy, sy = cos(yaw / 2.0), sin(yaw / 2.0)

@@ -19,7 +19,8 @@ CORNER_PX = 0.5
 
 
 def read_polylines(message: memoryview) -> list[NDArray[np.float64]]:
-    """The polylines of an ImageAnnotations message in their order, each (n, 2): x, y in pixels.
+    """Read the polylines of an ImageAnnotations message in their order, each (n, 2): x, y in
+    pixels.
 
     Each point takes 20 bytes, and all points are read as one array instead of one protobuf object
     each. Raises ValueError when the message is damaged.

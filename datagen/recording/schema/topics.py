@@ -52,12 +52,13 @@ NANOSECONDS = 1_000_000_000
 
 
 def log_time_ns(step: int, frequency_hz: int) -> int:
-    """Log time (ns since 1970) of frame `step` (from 0) of a round with `frequency_hz` frames/s."""
+    """Return the log time (ns since 1970) of frame `step` (from 0) of a round with `frequency_hz`
+    frames/s."""
     return EPOCH_NS + step * NANOSECONDS // frequency_hz
 
 
 def steps_at(log_times: NDArray[np.int64], frequency_hz: int) -> NDArray[np.int64]:
-    """Numbers (N,) of the frames with the log times `log_times` (N,) in ns."""
+    """Return the frame numbers (N,) of the log times `log_times` (N,) in ns."""
     steps: NDArray[np.int64] = -(-(log_times - EPOCH_NS) * frequency_hz // NANOSECONDS)
     return steps
 
@@ -68,7 +69,8 @@ def seconds(log_time: int) -> float:
 
 
 def schema_data(message_type: Any) -> bytes:
-    """The serialised FileDescriptorSet that MCAP stores for a protobuf schema."""
+    """Return the serialised FileDescriptorSet that MCAP stores as the schema of the protobuf class
+    `message_type`."""
     files: dict[str, FileDescriptor] = {}
     _collect(message_type.DESCRIPTOR.file, files)
     descriptors = FileDescriptorSet()
