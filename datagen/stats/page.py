@@ -93,7 +93,7 @@ def _histograms(by_split: dict[str, Labels]) -> Iterator[Markup]:
 
 
 def concerns(statistics: dict[str, Any], rounds: Iterable[RoundInfo]) -> list[str]:
-    """Warnings about the dataset, one sentence each. `statistics` is the result of
+    """Return warnings about the dataset, one sentence each. `statistics` is the result of
     `datagen.recording.statistics.describe`."""
     return [
         *_empty_splits(statistics),
