@@ -119,7 +119,7 @@ def _send(recording: rr.RecordingStream, entity: str, time: rr.TimeColumn, colum
 
 
 def plot_entity(plot: Plot) -> str:
-    """Path of the Rerun entity that contains the series of a plot."""
+    """Return the path of the Rerun entity that contains the series of a plot."""
     return f"{PLOTS}/{_entity_name(plot.title)}"
 
 
@@ -130,7 +130,8 @@ def _entity_name(title: str) -> str:
 
 
 def layout(contents: Contents) -> rrb.Blueprint:
-    """Layout of the viewer: images and 3D view left, plots right; the 3D view follows the car."""
+    """Return the layout of the viewer: images and 3D view left, plots right; the 3D view follows
+    the car."""
     plots = [
         rrb.TimeSeriesView(
             origin=plot_entity(plot),

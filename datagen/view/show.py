@@ -46,7 +46,8 @@ class ShowConfig:
 
 
 def show(contents: Contents, config: ShowConfig, on_shown: OnShown) -> None:
-    """Show a round as the options in `config` require, and call `on_shown`.
+    """Show a round as the options in `config` require, and call `on_shown` with the path, the URL
+    or the name of the window where it is shown.
 
     Raises UserError or OSError, and KeyboardInterrupt when the user stops the web viewer.
     """

@@ -79,14 +79,16 @@ class Steps:
         return (self[number] for number in range(len(self)))
 
     def message(self, topic: str, number: int) -> Any:
-        """Parse message `number` of an opened topic. Raises DatasetError if it is damaged."""
+        """Parse message `number` of an opened topic and return the protobuf object. Raises
+        DatasetError if the message is damaged."""
         try:
             return MESSAGE_TYPES[topic].FromString(bytes(self.payload(topic, number)))
         except DAMAGE_ERRORS as error:
             raise self._damaged(topic, number, error) from error
 
     def payload(self, topic: str, number: int) -> memoryview:
-        """The bytes of message `number` of a topic. Raises DatasetError if its chunk is damaged."""
+        """Return the bytes of message `number` of a topic. Raises DatasetError if its chunk is
+        damaged."""
         try:
             return self.index.messages[topic].payload(number)
         except DAMAGE_ERRORS as error:
@@ -114,8 +116,8 @@ class Steps:
 
 
 def values(message: Any) -> dict[str, Value]:
-    """The fields of a protobuf message by name. Absent fields are None; enum values are lower-case
-    names."""
+    """Return the fields of a protobuf message by name. Absent fields are None; enum values are
+    lower-case names."""
     return {f.name: _value(message, f) for f in message.DESCRIPTOR.fields}
 
 
