@@ -18,8 +18,12 @@ MIN_TOKEN_LENGTH = 16
 
 
 def read_token(path: Path | None) -> str | None:
-    """Read the token from the file `path`, or without `path` from $DRIVERVIEW_TOKEN; None if that
-    is empty. Raises UserError if the file is missing or the token is unsuitable."""
+    """Read the token from the file `path`, or from $DRIVERVIEW_TOKEN if `path` is None; return None
+    if the variable is unset or empty.
+
+    Raises UserError if the file is missing or empty, or if the token is shorter than 16 characters
+    or has a space or a character that is not printable ASCII.
+    """
     if path is None:
         token = os.environ.get(TOKEN_VARIABLE, "").strip()
         source = f"${TOKEN_VARIABLE}"
@@ -65,7 +69,8 @@ class HostNames:
     """The host names that a service accepts: loopback names and addresses, and the given names."""
 
     def __init__(self, names: Iterable[str], *, any_name: bool) -> None:
-        """With `any_name` every Host is accepted; for services that require a token."""
+        """Accept the Host names `names`; `any_name` accepts every Host, for a service that requires
+        a token from each client."""
         found = (host_name(name.encode("latin-1", "replace")) for name in names)
         self._names = {name for name in found if name is not None}
         self._any_name = any_name
@@ -99,7 +104,8 @@ class HostNames:
 
 
 def host_name(host: bytes) -> str | None:
-    """The name in a Host header (`name` or `name:port`), in lower case; None if it is malformed.
+    """Return the name in a Host header (`name` or `name:port`), in lower case; None if the header
+    is malformed.
 
     An IPv6 address is returned in its shortest form, without brackets and without its zone, because
     a zone has a meaning on one machine only.

@@ -197,8 +197,11 @@ def _kalibr(content: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def read_distortion(model: Any, given: list[float]) -> dict[str, Any]:
-    """The fields `distortion` and `coefficients` of `CameraParameters` for a lens model (any key of
-    `MODELS`) with the coefficients `given`; none for a pinhole. Raises CameraError."""
+    """Return the fields `distortion` and `coefficients` of `CameraParameters` for a lens model (any
+    key of `MODELS`) with the coefficients `given`; an empty dict for a pinhole.
+
+    Raises CameraError for an unknown model.
+    """
     if not isinstance(model, str) or model.lower() not in MODELS:
         known = ", ".join(MODELS)
         raise CameraError(f"the distortion model is {model!r}; known models are {known}")

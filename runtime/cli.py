@@ -58,7 +58,8 @@ def print_result(content: dict[str, Any], as_json: bool, line: str) -> None:
 
 
 def progress_bar() -> "Progress":
-    """A progress bar on stderr with "done/total"; it is erased when its `with` block ends."""
+    """Create a progress bar on stderr with "done/total"; it is erased when its `with` block
+    ends."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
@@ -82,7 +83,8 @@ def progress(text: str = "") -> Iterator[Callable[..., None]]:
 
 
 def printable(text: str) -> str:
-    """`text` in one line: control characters, which file names can contain, become escapes."""
+    """Return `text` with control characters, which file names can contain, as escapes, so that it
+    stays one line."""
     return text if text.isprintable() else "".join(map(_printable, text))
 
 
@@ -92,7 +94,7 @@ def _printable(character: str) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """The number and the noun, in the plural if needed: "1 round", "2 rounds"."""
+    """Return the number and the noun, in the plural if needed: "1 round", "2 rounds"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -21,8 +21,8 @@ STAGED = ".staged"  # the folder of `replaced_files` for new files
 
 
 def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
-    """Sort key of a name that orders numbers by value and ignores case: `frame2` before `frame10`,
-    `A1` before `b1`.
+    """Return a sort key of a name that orders numbers by value and ignores case: `frame2` before
+    `frame10`, `A1` before `b1`.
 
     A run of ASCII digits is a number; other digits, signs and decimal points are text.
     """
@@ -56,12 +56,12 @@ def utf8_path(path: Path) -> Iterator[Path]:
 
 
 def name_as_text(name: str) -> str:
-    """The name of a file as text that can be encoded: bytes that are not UTF-8 become escapes."""
+    """Return a file name as text that can be encoded: bytes that are not UTF-8 become escapes."""
     return name.encode(errors="backslashreplace").decode()
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hex."""
+    """Compute the SHA-256 of a file's bytes, in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -110,7 +110,7 @@ def write_json(path: Path, content: object) -> None:
 
 
 def unfinished_path(path: Path) -> Path:
-    """The name of the temporary file that `atomic_write` renames to `path`."""
+    """Return the path of the temporary file that `atomic_write` renames to `path`."""
     return path.with_name(path.name + ".partial")
 
 

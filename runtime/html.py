@@ -34,20 +34,20 @@ def render(package: str, template: str, **values: Any) -> str:
 
 
 def format_number(value: float | None, digits: int) -> str:
-    """`value` with `digits` decimal places; "-" for None."""
+    """Format `value` with `digits` decimal places; "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def format_percent(share: float | None, digits: int = 1) -> str:
-    """`share` in [0, 1] as a percentage with `digits` decimal places; "-" for None."""
+    """Format `share` in [0, 1] as a percentage with `digits` decimal places; "-" for None."""
     return "-" if share is None else f"{share:.{digits}%}"
 
 
 def data_uri(content: bytes, media_type: str = "image/jpeg") -> str:
-    """A `data:` URI with the content of a file."""
+    """Return a `data:` URI with the content of a file."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
 
 
 def embed_jpeg(image: NDArray[np.uint8]) -> str:
-    """A `data:` URI of an image (H, W, 3) uint8 RGB, encoded as JPEG."""
+    """Encode an image (H, W, 3) uint8 RGB as JPEG and return it as a `data:` URI."""
     return data_uri(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=JPEG_QUALITY))

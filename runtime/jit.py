@@ -36,7 +36,8 @@ def code_folder(name: str, *packages: Path) -> Path:
 
     The folder is named after `name` and a hash of the sources. It is in `$NUMBA_CACHE_DIR`, or in
     the user's cache folder; if neither is writable, it is a temporary folder that is deleted when
-    the process ends. Folders of other versions that were unused for `UNUSED_DAYS` are deleted.
+    the process ends. Folders of other versions that were unused for 30 days (UNUSED_DAYS) are
+    deleted.
 
     numba unpickles and executes the files of this folder, so only this user must be able to write
     to it. A temporary folder needs a random name: another user could create a predictable one.
@@ -121,7 +122,8 @@ def callable_from_compiled(function: Function) -> Function:
 
 
 class Borrow(Protocol):
-    """The type of `borrowed`: a function that returns its argument."""
+    """The type of `borrowed`, which compiled code calls to use an array without reference
+    counting."""
 
     def __call__(self, array: Item) -> Item: ...
 

@@ -16,7 +16,7 @@ Command = Callable[..., None]
 def options_of(
     config: Any, *, make: Callable[..., Any] | None = None, only_given: bool = False
 ) -> Callable[[Command], Command]:
-    """Decorator that adds the options of the dataclass `config` to a command.
+    """Return a decorator that adds the options of the dataclass `config` to a command.
 
     The first argument of the command is an instance of `config`, or the result of `make` called
     with the options' values (`dict` if the command computes other fields itself). With `only_given`

@@ -1,4 +1,5 @@
-"""Finds out whether this processor multiplies bf16 and int8 natively; otherwise they are slow.
+"""Finds out whether this processor has instructions for bf16 and for int8 numbers; without them, a
+network in these formats is slow.
 
 The flags in /proc/cpuinfo show it. On systems other than Linux no format counts as native.
 """
@@ -25,8 +26,8 @@ def has_int8() -> bool:
 
 @cache
 def flags(cpuinfo: Path) -> frozenset[str]:
-    """Flags (x86) or features (ARM) of the first processor in the file `cpuinfo`; empty if there is
-    no such file."""
+    """Return the flags (x86) or features (ARM) of the first processor in the file `cpuinfo`; empty
+    if there is no such file."""
     if not cpuinfo.is_file():
         return frozenset()
     for line in cpuinfo.read_text().splitlines():

@@ -1,4 +1,4 @@
-"""Lets a loop end after a signal, between two of its steps."""
+"""Lets a loop end after a signal, between two iterations."""
 
 import signal
 import threading
@@ -9,11 +9,13 @@ from types import FrameType
 
 @contextmanager
 def interrupts(*numbers: int) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether one of these signals has arrived; a loop calls it.
+    """Yield a function that returns whether one of the signals `numbers` has arrived; a loop calls
+    it.
 
     A KeyboardInterrupt raised inside a callback, a finaliser or an extension module can be lost:
     numpy discards one that is raised while it compares a scalar with an IntEnum. A second signal
-    raises KeyboardInterrupt. Only the main thread receives signals; elsewhere the result is False.
+    raises KeyboardInterrupt. Only the main thread can receive signals; in another thread the
+    function always returns False.
     """
     seen: list[int] = []
     if threading.current_thread() is not threading.main_thread():

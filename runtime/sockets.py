@@ -126,10 +126,12 @@ def is_localhost(host: str) -> bool:
 def connect(
     place: tuple[str, int], timeout_s: float | None, source: tuple[str, int] | None = None
 ) -> socket.socket:
-    """Connect to the first address of `place` (host, port) that accepts, in `timeout_s` in total.
+    """Connect to the first address of `place` (host, port) that accepts, in `timeout_s` in total,
+    from the local address `source` if it is given.
 
-    Each address gets an equal share of the remaining time, but at least CONNECT_S if that remains.
-    Raises the first OSError. It has the same arguments as `socket.create_connection`.
+    Each address gets an equal share of the remaining time, but at least 0.25 s (CONNECT_S) if so
+    much remains. Raises the OSError of the first address; the error of a missing IPv4 or IPv6 only
+    if there is no other. The arguments are those of `socket.create_connection`.
     """
     host, port = place
     addresses = _addresses(host, port)
@@ -173,19 +175,19 @@ def refuse_connections(listener: socket.socket) -> None:
 
 
 def address(listener: socket.socket, host: str) -> str:
-    """The URL of the service on a bound socket, with the actual port (for port 0 the system chose
-    it)."""
+    """Return the URL of the service on a bound socket, with the actual port (for port 0 the system
+    chose it)."""
     return url(host, listener.getsockname()[1])
 
 
 def url(host: str, port: int) -> str:
-    """The URL of a service; the zone of an IPv6 address is escaped as in RFC 6874."""
+    """Return the URL of a service; the zone of an IPv6 address is escaped as in RFC 6874."""
     shown = f"[{host.replace('%', '%25')}]" if ":" in host else host
     return f"http://{shown}:{port}"
 
 
 def shown_addresses(listeners: Iterable[socket.socket]) -> str:
-    """The addresses of bound sockets as text, such as "127.0.0.1 and ::1"."""
+    """Return the addresses of bound sockets as text, such as "127.0.0.1 and ::1"."""
     return " and ".join(str(listener.getsockname()[0]) for listener in listeners)
 
 

@@ -1,7 +1,8 @@
 """SVG charts for HTML pages: line plots, reliability diagrams, histograms and bars.
 
-The SVG of a plot has coordinates from 0 to `SIDE`, y down, and is stretched over its box. Labels
-are HTML, so that the text does not scale with the box. Pages with charts include `svg_charts.css`.
+The SVG of a plot has coordinates from 0 to 1000 (SIDE), y down, and is stretched over its box.
+Labels are HTML, so that the text does not scale with the box. Pages with charts include
+`svg_charts.css`.
 """
 
 import math
@@ -24,8 +25,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis. Called with values, it maps those from `first` to `last` to SVG coordinates from 0
-    to SIDE; with `log` on a logarithmic scale."""
+    """An axis from the value `first` to the value `last`, logarithmic with `log`. Calling it maps
+    values to SVG coordinates, 0 at `first` and 1000 (SIDE) at `last`."""
 
     first: float
     last: float
@@ -48,7 +49,8 @@ class Axis:
 
 
 def value_range(columns: Iterable[FloatArray], *, log: bool) -> tuple[float, float]:
-    """Limits (low, high) of an axis that shows all finite values of `columns` with a margin."""
+    """Return the limits (low, high) of an axis that shows all finite values of `columns` with a
+    margin."""
     values = np.concatenate([column[np.isfinite(column)] for column in columns])
     if not len(values):
         return (LOG_FLOOR, 1.0) if log else (-1.0, 1.0)
@@ -60,7 +62,7 @@ def value_range(columns: Iterable[FloatArray], *, log: bool) -> tuple[float, flo
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Three to eight round numbers between `low` and `high`; none unless `high` > `low`."""
+    """Return three to eight round numbers between `low` and `high`; none unless `high` > `low`."""
     if not high > low:
         return []
     step = 10 ** math.floor(math.log10((high - low) / 3))
@@ -70,8 +72,8 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Ticks between two positive numbers: 1, 2 and 5 times each power of ten; only the powers of
-    ten if more than four of them are in the range."""
+    """Return ticks between two positive numbers: 1, 2 and 5 times each power of ten; only the
+    powers of ten if more than four of them are in the range."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     found = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 5)]
     inside = [value for value in found if low <= value <= high]
@@ -111,7 +113,7 @@ class Plot:
 
 
 def line_plot(plot: Plot) -> Markup:
-    """The plot as an HTML figure; it has the text "not yet" if the plot has no lines."""
+    """Draw the plot as an HTML figure; it has the text "not yet" if the plot has no lines."""
     if not plot.lines:
         note = Markup("<figure><figcaption>{}</figcaption><p>not yet</p></figure>")
         return note.format(plot.title)
@@ -139,7 +141,7 @@ def line_plot(plot: Plot) -> Markup:
 
 
 def reliability_diagram(title: str, predicted: FloatArray, observed: FloatArray) -> Markup:
-    """Chart, as an HTML figure, of observed errors (N,) over predicted standard deviations (N,), on
+    """Draw observed errors (N,) over predicted standard deviations (N,) as an HTML figure, on
     logarithmic axes with the diagonal."""
     both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
     low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
@@ -175,7 +177,7 @@ def _points(x_axis: Axis, y_axis: Axis, x: FloatArray, y: FloatArray) -> list[st
 
 
 def runs(present: NDArray[np.bool_]) -> list[slice]:
-    """The slices of consecutive indices at which `present` (N,) is true."""
+    """Return the slices of consecutive indices at which `present` (N,) is true."""
     edges = np.flatnonzero(np.diff(present, prepend=False, append=False))
     return [slice(a, b) for a, b in edges.reshape(-1, 2).tolist()]
 
@@ -227,10 +229,11 @@ MARGIN, FOOT = 6, 18
 
 
 def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) -> Markup:
-    """Histogram, as an HTML figure, of the finite values (N,) of each split in `BINS` equal bins.
+    """Draw a histogram of the finite values (N,) of each split in 48 equal bins (BINS) as an HTML
+    figure.
 
-    NaN means inactive. The bins of a split sum to one, so that splits of different sizes can be
-    compared.
+    NaN is an absent value; the figure states the share of values that are present. The bins of a
+    split sum to one, so that splits of different sizes can be compared.
     """
     finite = {split: column[np.isfinite(column)] for split, column in values.items()}
     filled = [column for column in finite.values() if column.size]
@@ -254,8 +257,8 @@ def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) 
 
 
 def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
-    """Bar chart as an HTML figure: a row for each name in `counts`, with a bar for its number of
-    frames in each split, in the order of `SPLIT_COLOURS`."""
+    """Draw a bar chart as an HTML figure: a row for each name in `counts`, with a bar for each of
+    its numbers of frames, which are those of the splits train, test and unseen in this order."""
     top = max((max(row) for row in counts.values()), default=0) or 1
     rows = []
     for name, row in counts.items():

@@ -4,8 +4,8 @@ import os
 
 
 def thread_limits(workers: int) -> dict[str, str]:
-    """Environment variables that give each of `workers` processes its share of the cores; libraries
-    read them when they are loaded."""
+    """Return the environment variables that give each of `workers` processes its share of the
+    cores; libraries read them when they are loaded."""
     share = (os.cpu_count() or 1) // workers
     return {
         "LP_NUM_THREADS": str(share if share > 1 else 0),
