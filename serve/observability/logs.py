@@ -51,8 +51,8 @@ class JsonFormatter(logging.Formatter):
 
 
 class Interval:
-    """Lets each key pass at most once in INTERVAL_S times `workers`, so that `workers` processes
-    together let it pass at most once per INTERVAL_S on average."""
+    """Lets each key pass at most once in `workers` seconds, so that `workers` processes together
+    let it pass at most once per second (INTERVAL_S) on average."""
 
     def __init__(self, workers: int = 1) -> None:
         self._interval_s = INTERVAL_S * workers
@@ -69,8 +69,8 @@ class Interval:
 
 
 class ErrorLimit(logging.Filter):
-    """Lets warnings and errors with the same logger and text template pass at most once per
-    INTERVAL_S."""
+    """Lets warnings and errors with the same logger and text template pass at most once in
+    `workers` seconds. Lines of the supervisor have no limit."""
 
     def __init__(self, workers: int = 1) -> None:
         super().__init__()
@@ -89,7 +89,8 @@ class ErrorLimit(logging.Filter):
 
 
 def set_up(workers: int = 1) -> None:
-    """Configure logging to stderr in one of `workers` processes."""
+    """Configure logging to stderr in one of `workers` processes, each of which gets its share of
+    the permitted rate of lines."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter())
     handler.addFilter(ErrorLimit(workers))
@@ -153,7 +154,7 @@ class RefusalLog:
 
 
 def log_answer(request_id: str, client: str, total_ms: float) -> None:
-    """Log an answered request."""
+    """Log an answered request; `total_ms` is the time from its arrival to the answer."""
     fields = {
         "request": request_id,
         "client": client,

@@ -1,8 +1,8 @@
 """Counts frames and connections in shared memory, and writes the page of counts for Prometheus.
 
-Only the event loop of one worker writes a block, so an increment needs no lock. A replacement
-worker continues the counts in the block of its predecessor, so counters never decrease.
-Source: Prometheus text exposition format 0.0.4.
+Each worker has its own block of counters, which only its event loop writes, so an increment needs
+no lock. A replacement worker continues the counts in the block of its predecessor, so counters
+never decrease. Source: Prometheus text exposition format 0.0.4.
 """
 
 from bisect import bisect_left
@@ -52,7 +52,7 @@ class Metrics:
             at += STAGE_WORDS
 
     def count_refusal(self, problem_type: ProblemType, waiting: int) -> None:
-        """Count a refused frame."""
+        """Count a refused frame; `waiting` is the number of queued frames."""
         self._own[FRAME_COUNTS + OUTCOME_INDEX[problem_type]] += 1.0
         self._own[WAITING] = waiting
 
@@ -61,8 +61,8 @@ class Metrics:
         self._own[CLOSED_COUNTS + OUTCOME_INDEX[problem_type]] += 1.0
 
     def page(self, now: float, provenance: dict[str, str]) -> str:
-        """The metrics of all workers as text for Prometheus. `now` is in s of the monotonic clock;
-        `provenance` identifies the served model."""
+        """Return the metrics of all workers as text for Prometheus. `now` is in s of the monotonic
+        clock; `provenance` identifies the served model."""
         return "\n".join([*self._lines(now, provenance), ""])
 
     def _lines(self, now: float, provenance: dict[str, str]) -> Iterator[str]:

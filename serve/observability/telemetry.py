@@ -26,7 +26,8 @@ INSTALL = "pip install 'driverview[telemetry]'"
 
 
 def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
-    """The entry point of the exporter that the environment selects; None if traces are disabled.
+    """Return the entry-point name of the exporter that the environment selects; None if traces are
+    disabled.
 
     Raises UserError if the exporter is not installed.
     """
@@ -47,7 +48,7 @@ def exporter_name(environment: Mapping[str, str] = os.environ) -> str | None:
 
 
 def tracer() -> "Tracer | None":
-    """The tracer of this process, with the selected exporter; None if traces are disabled."""
+    """Create the tracer of this process with the selected exporter; None if traces are disabled."""
     name = exporter_name()
     if name is None:
         return None
