@@ -27,15 +27,16 @@ class Admission:
     """Admits large images by their estimated decoding time. Use it in the event loop's thread."""
 
     def __init__(self, waiting: FairQueue) -> None:
-        """`waiting` is the frame queue; it knows whether other clients are present."""
+        """`waiting` is the frame queue, which records whether other clients have sent frames
+        recently."""
         self._waiting = waiting
         self._pending_ms = 0.0
         self._client_ms: dict[Client, float] = {}  # cost of unfinished images
         self._credit: dict[Client, tuple[float, int]] = {}  # (remaining ms, at this time in ns)
 
     def admit(self, client: Client, cost_ms: float, now_ns: int) -> Callable[[], None]:
-        """Admit a large image with the estimated decoding time `cost_ms`. Returns a function to
-        call when the image is done. Raises Problem if it is refused."""
+        """Admit a large image with the estimated decoding time `cost_ms`; `now_ns` is monotonic.
+        Returns a function to call when the image is done. Raises Problem if it is refused."""
         client = network_of(client)
         own = self._client_ms.get(client, 0.0)
         if own and own + cost_ms > MAX_CLIENT_MS:

@@ -66,18 +66,21 @@ class BodyShare:
         self.size = 0
 
     def receive(self, size: int) -> None:
-        """Reserve `size` more bytes of a body. Raises Problem, also if the body is too large."""
+        """Reserve `size` more bytes for received bytes of the body. Raises Problem if the body is
+        then too large or the budget is exhausted."""
         if self.size + size > MAX_BODY_BYTES:
             raise body_too_large(f"more than {MAX_BODY_BYTES} bytes")
         self.grow(size)
 
     def grow(self, size: int) -> None:
-        """Reserve `size` more bytes. Raises Problem."""
+        """Reserve `size` more bytes, without a limit for a single body. Raises Problem if the
+        budget is exhausted."""
         self._budget.take(size, self.size + size <= SMALL_BYTES)
         self.size += size
 
     def hold(self, size: int) -> None:
-        """Change the reserved size to `size` bytes. Raises Problem."""
+        """Increase or reduce the reserved size to `size` bytes. Raises Problem if the budget is
+        exhausted."""
         if size > self.size:
             self.grow(size - self.size)
         elif size < self.size:

@@ -44,14 +44,15 @@ class FairQueue:
         return all(slot.frame.small for slot in self._slots)
 
     def note(self, client: str, now_ns: int) -> None:
-        """Record that a client has sent a frame, also if the frame is then refused."""
+        """Record that a client has sent a frame at `now_ns`, also if the frame is then refused."""
         client = network_of(client)
         if client != self._newest[0]:
             self._other = self._newest
         self._newest = (client, now_ns)
 
     def others_present(self, client: str, now_ns: int) -> bool:
-        """Whether a client other than `client` has sent a frame within the last PRESENT_NS."""
+        """Whether a client other than `client` has sent a frame within the last second
+        (PRESENT_NS)."""
         same = self._newest[0] == network_of(client)
         latest_ns = (self._other if same else self._newest)[1]
         return now_ns - latest_ns < PRESENT_NS
@@ -68,13 +69,13 @@ class FairQueue:
         self._discount(slot)
 
     def of_stream(self, stream: int) -> Slot | None:
-        """The slot of a stream's waiting frame; None if no frame of the stream waits."""
+        """Return the slot of a stream's waiting frame; None if no frame of the stream waits."""
         return next((slot for slot in self._slots if slot.frame.stream == stream), None)
 
     def giving_way_to(self, client: str) -> Slot | None:
-        """The slot that a full queue removes to make room for a frame of `client`: the newest slot
-        of the client with the most slots. None unless that client has at least two slots more than
-        `client`."""
+        """Return the slot that a full queue removes to make room for a frame of `client`: the
+        newest slot of the client with the most slots. None unless that client has at least two
+        slots more than `client`."""
         counts = self._counts
         most = max(counts.values(), default=0)
         if most < counts[network_of(client)] + 2:

@@ -55,9 +55,9 @@ class FrameQueue:
         capacity: int,
         single_core: bool = False,
     ) -> None:
-        """`capacity`: largest number of frames that wait while a frame is processed.
-
-        `single_core`: the worker has no second core for the thread.
+        """At most `capacity` frames wait while a frame is processed. `warm_up` runs and checks the
+        engine before the first frame. With `single_core` (the worker has no second core) the event
+        loop itself processes small frames even if several wait.
         """
         self._current = LoadedEngine.of(engine)
         self._staged: StagedEngine | None = None
@@ -121,7 +121,7 @@ class FrameQueue:
             self._staged = StagedEngine(LoadedEngine.of(engine), is_committed)
 
     def drop_staged_model(self) -> None:
-        """Discard the staged engine, unless it is committed."""
+        """Discard the staged engine, unless its `is_committed()` already returns True."""
         with self._model_lock:
             self._promote_staged()
             self._staged = None
@@ -146,7 +146,7 @@ class FrameQueue:
         return self._thread_busy and self.full
 
     def refusal(self, client: str) -> Problem | None:
-        """The problem if the queue has no room for a client's frame, else None.
+        """Return the problem if the queue has no room for a client's frame, else None.
 
         Many frames share this object, so code that raises it must drop its traceback afterwards.
         """

@@ -16,8 +16,8 @@ from serve.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 
 @lru_cache(4096)
 def client_key(address: str, public: bool = False) -> float:
-    """The key of a client address in the table of buckets: an integer above 0 that a float holds
-    exactly; 0.0 for this machine.
+    """Return the key of a client address in the table of buckets: an integer above 0 that a float
+    holds exactly; 0.0 for this machine.
 
     All addresses of an IPv6 /64 network have the same key. `public` gives another key, for the
     bucket of paths that need no token.
@@ -39,10 +39,11 @@ class RateLimiter:
         self._burst = max(1.0, per_second)  # a rate below 1/s must still allow a request
 
     def check(self, address: str, now: float | None = None, public: bool = False) -> None:
-        """Count a request of a client; raise Problem if the client exceeds its rate.
+        """Count a request of a client; raise Problem if the client exceeds its rate. `now` is in s
+        of the monotonic clock; None reads the clock.
 
-        `public`: the path needs no token. These paths have a separate bucket, so that a client
-        that floods /features does not make a load balancer's probe from the same address fail.
+        `public`: the path needs no token. These paths have a separate bucket, so that a client that
+        floods /features does not make a load balancer's probe from the same address fail.
         """
         key = client_key(address, public)
         if key == 0.0 or self._rate <= 0:

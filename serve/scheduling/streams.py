@@ -15,7 +15,8 @@ EXPIRY_NS = 10_000_000_000  # age at which another stream can use the entry; all
 
 @lru_cache(4096)
 def stream_key(client: str, name: str) -> int:
-    """The key of a client's stream, never 0. Equal names of two clients are different streams."""
+    """Return the key of a client's stream, never 0. Equal names of two clients are different
+    streams."""
     digest = blake2b(f"{client}\0{name}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") | 1
 
