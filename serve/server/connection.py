@@ -40,7 +40,7 @@ FREE_CHUNKS, CHUNK_BYTES = 512, 512
 
 
 class Phase(Enum):
-    """State of a connection."""
+    """State of a connection: what it waits for."""
 
     HEAD = auto()  # waiting for headers
     BODY = auto()  # waiting for a body
@@ -83,8 +83,8 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_after_reply()
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close the connection if it has been idle for DRAIN_S, `elapsed_s` after draining began.
-        Returns whether all replies to its client have been sent."""
+        """Close the connection after 1 s (DRAIN_S) without a request, counted from the start of
+        draining, `elapsed_s` ago. Returns whether all replies to its client have been sent."""
         idle = self._phase is Phase.IDLE or (self._phase is Phase.HEAD and not self._unread_bytes)
         # Answers sent before draining began had no "Connection: close", so the client can send
         # one more request.
@@ -98,7 +98,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.close_with(stopping())
 
     def leave(self) -> None:
-        """Give up the connection to a WebSocket."""
+        """Stop managing this connection, because a WebSocket takes it over."""
         self.connections.discard(self)
         self._phase, self._deadline_s = Phase.CLOSING, inf
         self.group.pop(self, None)
@@ -304,7 +304,7 @@ class GuardedProtocol(HttpToolsProtocol):
         (self.transport.close if idle else self.transport.abort)()
 
     def end_slow_body(self, now: float) -> int:
-        """Refuse a body that has been arriving for EVICTABLE_S; returns the bytes it held."""
+        """End a body that has been arriving for 0.1 s (EVICTABLE_S); return the bytes it held."""
         if self._phase is not Phase.BODY or now - self.since_s < guards.EVICTABLE_S:
             return 0
         held = 0 if self.cycle is None or self.cycle.response_complete else self._unread_bytes
@@ -312,7 +312,7 @@ class GuardedProtocol(HttpToolsProtocol):
         return held
 
     def expire(self, now: float) -> None:
-        """Close the connection if its deadline has passed."""
+        """Close the connection if its deadline is before `now` (in s of the guard's clock)."""
         if now < self._deadline_s:
             return
         phase, limits = self._phase, self.guard.limits

@@ -25,7 +25,8 @@ ASGI_HEADERS = frozenset({b"expect", b"upgrade", b"x-forwarded-for"})
 
 
 class NullEvent:
-    """Stands for uvicorn's event of a request; no task waits for it."""
+    """An event that does nothing: uvicorn sets the event of each request, but no task waits for it
+    here."""
 
     def set(self) -> None:
         """Do nothing."""
@@ -70,7 +71,8 @@ class DirectRequest:
             self.parts.append(bytearray(part))
 
     def drop(self) -> None:
-        """Drop the body and `features`; this object and `features` reference each other."""
+        """Drop the body and `features`. This object and `features` reference each other; without
+        this, both would stay in memory until the next garbage collection."""
         if self.features is not None:
             self.features.abandon()
         self.features = None

@@ -41,10 +41,11 @@ class Guarded(Protocol):
         """End the connection to make room for a new connection."""
 
     def expire(self, now: float) -> None:
-        """End the connection if its deadline has passed."""
+        """End the connection if its deadline is before `now` (in s of the guard's clock)."""
 
     def end_slow_body(self, now: float) -> int:
-        """End the connection if a body has been arriving for EVICTABLE_S; returns its bytes."""
+        """End the connection if a body has been arriving for 0.1 s (EVICTABLE_S) at `now` (in s);
+        returns the number of bytes of the body."""
 
 
 class Drained(Guarded, Protocol):
@@ -133,8 +134,8 @@ class ConnectionGuard:
                 del self.open[connection.network]
 
     def make_room_for(self, newcomer: Guarded, excess: int) -> bool:
-        """End `excess` connections. Returns False if fewer could be ended; then another worker is
-        asked to end one."""
+        """End `excess` connections so that the new connection `newcomer` can stay. Returns False if
+        fewer could be ended; then the worker with the most connections is asked to end one."""
         least = self._count(newcomer)
         made = self.make_room(excess, least)
         if not made:
@@ -145,9 +146,10 @@ class ConnectionGuard:
         """End `excess` connections: refused, slow, idle, then WebSockets, the oldest first. Returns
         False if fewer could be ended.
 
-        `least` is the number of connections of the newcomer's client. Clients with fewer
-        connections lose none. If all candidates are too young, young connections of clients with
-        more than `least` connections are ended.
+        Refused connections of any client are ended, others only if their client has at least
+        `least` connections, the number of the new connection's client. A request counts as slow
+        after 0.1 s (EVICTABLE_S), a WebSocket as idle after `idle_s` without a message. If too few
+        are that old, younger ones are ended of clients with more than `least` connections.
         """
         for group, age_s, count in (
             (self.refused, 0.0, 0),
@@ -197,7 +199,7 @@ class ConnectionGuard:
         return freed
 
     def pause_reading(self, connection: HttpToolsProtocol) -> None:
-        """Pause reading from a refused client for REFUSAL_PAUSE_S.
+        """Pause reading from a refused client for 2 ms (REFUSAL_PAUSE_S).
 
         So the event loop handles the next requests of all clients refused in this time together.
         Waking it for each request would take processor time from the engine.
@@ -208,8 +210,8 @@ class ConnectionGuard:
         self.paused.append(connection)
 
     def pause_after(self, connection: HttpToolsProtocol, size: int) -> None:
-        """Pause reading from a connection after a read of `size` bytes, if it is PAUSE_BYTES or
-        more, until the event loop has run its other work."""
+        """After a read of `size` bytes, if these are at least 32 KiB (PAUSE_BYTES), pause reading
+        from the connection until the event loop has run its other work."""
         if size >= PAUSE_BYTES and not connection.flow.read_paused:
             connection.flow.pause_reading()
             connection.loop.call_soon(self._read_on, connection)

@@ -1,6 +1,6 @@
 """Returns free memory of the C library's heap to the operating system.
 
-Without it the process keeps the memory that hundreds of connections or a few large images needed.
+The library alone would keep the memory that hundreds of connections or a few large images needed.
 """
 
 import ctypes
@@ -12,15 +12,15 @@ GROWTH_BYTES = 8 << 20  # growth of resident memory above its minimum that trigg
 
 
 class HeapTrimmer:
-    """Returns free heap memory to the system if resident memory has grown by GROWTH_BYTES above its
-    minimum."""
+    """Returns free heap memory to the system if resident memory is 8 MiB (GROWTH_BYTES) or more
+    above the minimum seen so far."""
 
     def __init__(self) -> None:
         self._least_bytes = _resident_bytes()
 
     def __call__(self) -> None:
-        """Return free heap memory to the system if resident memory has grown by GROWTH_BYTES. This
-        takes a few ms, so call it outside the event loop."""
+        """Compare the resident memory with its minimum, and return free heap memory to the system
+        if it has grown too much. This takes a few ms, so call it outside the event loop."""
         resident = _resident_bytes()
         self._least_bytes = min(self._least_bytes, resident)
         if resident - self._least_bytes >= GROWTH_BYTES:

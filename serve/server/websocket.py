@@ -4,7 +4,7 @@ This is uvicorn's protocol on the library websockets. A handshake that the libra
 answered with a problem. The handshake, each message, and the reading of answers have deadlines.
 Small frames (pings, fragments, short messages) and texts have a rate limit, since each costs as
 much as a large frame. Messages count in the memory budget for bodies until the service takes them.
-A client that exceeds a limit gets the reason in the close frame, which it can read for LINGER_S.
+A client that exceeds a limit gets the reason in the close frame, which it can read for 0.5 s.
 """
 
 from asyncio import Transport
@@ -81,7 +81,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self._draining = True
 
     def drain(self, elapsed_s: float) -> bool:
-        """Close the connection if all images are answered. Returns whether it is closing."""
+        """Close the connection if all images are answered, however long ago (`elapsed_s`) draining
+        began. Returns whether it is closing."""
         if self.handshake_complete and not (self._owed or self._queued_bytes):
             self.end_draining()
         return self._discarding or self.transport.is_closing()
@@ -253,7 +254,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.fail(CloseCode.TRY_AGAIN_LATER, "closed for another client: no message for long")
 
     def end_slow_body(self, now: float) -> int:
-        """Close if a message has been arriving for EVICTABLE_S; returns the bytes it held."""
+        """Close if a message has been arriving for 0.1 s (EVICTABLE_S) at `now` (in s); returns the
+        number of bytes it held."""
         held = 0 if self._share is None else self._share.size
         since_s = self._message_end_s - self._guard.limits.body_s
         if not held or self._discarding or now - since_s < guards.EVICTABLE_S:
@@ -263,7 +265,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         return held
 
     def expire(self, now: float) -> None:
-        """Close the connection if a deadline has passed."""
+        """Close the connection if one of its deadlines is before `now` (in s of the guard's
+        clock)."""
         if self._discarding or self.transport.is_closing():
             if self._closing_end_s == inf:
                 self._closing_end_s = now + guards.LINGER_S
@@ -281,7 +284,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             self.fail(CloseCode.POLICY_VIOLATION, f"a message took more than {limit_s:g} s")
 
     def fail(self, code: CloseCode, reason: str) -> None:
-        """Close with a reason; discard further bytes of the client."""
+        """Close with this WebSocket code and reason; discard further bytes of the client."""
         if self.conn.state is not State.OPEN:
             self.transport.abort()
             return
@@ -289,7 +292,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.handle_parser_exception()
 
     def handle_parser_exception(self) -> None:
-        """Send the close frame, then read and discard further bytes for LINGER_S.
+        """Send the close frame, then read and discard further bytes for 0.5 s (LINGER_S).
 
         Closing a connection with unread bytes resets it: the client would lose the close frame.
         """

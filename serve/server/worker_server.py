@@ -92,7 +92,8 @@ class WorkerServer(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         """Close expired connections, and one connection if another worker asked for room; publish
-        this worker's status. uvicorn calls this method ten times per second."""
+        this worker's status; return free memory every 50th tick. uvicorn calls this method ten
+        times per second with the number of the tick, and ends the server if it returns True."""
         self._close_expired()
         self._make_room_for_others()
         self._publish_status()
