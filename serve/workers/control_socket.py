@@ -24,14 +24,19 @@ Command = Callable[[str | None], Awaitable[str]]
 
 
 def socket_path(port: int) -> Path:
-    """Path of the control socket of the service on `port`."""
+    """Return the path of the control socket of the service on `port`."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(base) if base else Path(tempfile.gettempdir()) / f"driverview-{os.getuid()}"
     return folder / f"driverview-serve-{port}.sock"
 
 
 def send_command(port: int, command: str, model: str | None = None) -> str:
-    """Send a command to the service on `port` and return its answer. Raises UserError."""
+    """Send `command` (reload or restart), with `model` as the new model, to the service on `port`
+    and return its answer.
+
+    Raises UserError if no service of this user is found, if it does not answer in time, or if it
+    answers with an error.
+    """
     path = socket_path(port)
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(ANSWER_TIMEOUT_S)

@@ -75,7 +75,7 @@ class Supervisor:
         """Listen, and start all workers.
 
         Returns the first worker's report about its engine, or None if the service was stopped while
-        the workers loaded the model. Raises UserError.
+        the workers loaded the model. Raises UserError if a worker cannot load the model.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):

@@ -40,7 +40,7 @@ class WorkerTask:
     cameras: dict[str, CameraParameters] = field(default_factory=dict)
 
     def to_json_line(self) -> bytes:
-        """The task as one line of JSON."""
+        """Return the task as one line of JSON."""
         return json.dumps(asdict(self, dict_factory=stored)).encode() + b"\n"
 
     @classmethod
@@ -78,23 +78,25 @@ class WorkerProcess:
         return self._process.returncode is None
 
     def age_s(self) -> float:
-        """Time since the start of the process in s."""
+        """Return the time since the start of the process in s."""
         return time.monotonic() - self._started_s
 
     def exit_reason(self) -> str:
-        """The error that the worker reported at its start; else its exit code or signal."""
+        """Return the error that the worker reported at its start; if there is none, its exit code
+        or signal."""
         if self._start_error:
             return self._start_error
         code = self._process.returncode
         return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
     def send(self, **message: Any) -> None:
-        """Send a message to the worker."""
+        """Send the keyword arguments to the worker as a JSON message."""
         self._writer.write(json.dumps(message).encode() + b"\n")
 
     async def wait_loaded(self, generation: int, timeout_s: float) -> dict[str, Any]:
-        """Wait until the worker has loaded a generation of weights; returns its report.
-        Raises UserError if it failed, ended or exceeded `timeout_s`."""
+        """Wait until the worker has loaded a generation of weights; return its report ("model",
+        "engine", "precision"). Raises UserError if the worker failed, ended or exceeded
+        `timeout_s`."""
         result = self._load_result(generation)
         if self._reading.done():
             self._fail_pending_loads()
@@ -109,7 +111,8 @@ class WorkerProcess:
         return message
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until the worker can answer images. Raises UserError."""
+        """Wait until the worker can answer images. Raises UserError if it ends before or needs more
+        than `timeout_s`."""
         waits = [asyncio.ensure_future(w) for w in (self._ready.wait(), self.wait_exit())]
         await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
         for wait in waits:
