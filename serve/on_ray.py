@@ -60,7 +60,9 @@ def _application(folder: str, limits: Limits) -> Service:
 def build(args: dict[str, Any]) -> ray_serve.Application:
     """Build the Ray Serve application. Keys of `args`: `model` as for `serve`, found on this
     machine; `replicas`; `token_file` (default: the token in $DRIVERVIEW_TOKEN); `hosts`, the host
-    names that are accepted if there is no token. Raises UserError.
+    names that are accepted if there is no token.
+
+    Raises UserError for another key, an impossible value, or a model that is not found.
     """
     unknown = set(args) - ARGUMENTS
     if unknown:

@@ -122,7 +122,7 @@ class Problem(UserError):
 
 
 def as_problem(error: Problem | ImageError) -> Problem:
-    """The problem of an image that cannot be decoded; a Problem is returned unchanged."""
+    """Return the problem for an image that cannot be decoded; return a Problem unchanged."""
     if isinstance(error, Problem):
         return error
     problem_type = IMAGE_PROBLEMS[error.fault]
@@ -130,8 +130,9 @@ def as_problem(error: Problem | ImageError) -> Problem:
 
 
 def forget_frames(error: BaseException) -> None:
-    """Drop the tracebacks of an error and of its causes: their frames can reference the body of the
-    request, and the error itself, which makes a cycle."""
+    """Drop the tracebacks of `error` and of its causes. The stack frames in a traceback can
+    reference the body of the request and `error` itself, and this cycle would keep the body in
+    memory."""
     found: BaseException | None = error
     while found is not None:
         found.__traceback__ = None
@@ -139,12 +140,12 @@ def forget_frames(error: BaseException) -> None:
 
 
 def internal_error() -> Problem:
-    """The problem of an unexpected exception; the exception's text is not sent to the client."""
+    """Make the problem for an unexpected exception, without the text of the exception."""
     return Problem(INTERNAL, "the request could not be answered; see the service's log")
 
 
 def body_too_large(seen: str) -> Problem:
-    """The problem of a body that is too large; `seen` describes its size."""
+    """Make the problem for a body that is too large; `seen` describes its size."""
     return Problem(
         BODY_TOO_LARGE,
         f"the body has {seen}; the limit is {MAX_BODY_BYTES}: send a smaller image or "
@@ -153,40 +154,41 @@ def body_too_large(seen: str) -> Problem:
 
 
 def head_too_large() -> Problem:
-    """The problem of headers or trailers above the size limit."""
+    """Make the problem for headers or trailers above the size limit."""
     return Problem(HEAD_TOO_LARGE, f"the headers have more than {MAX_HEAD_BYTES} bytes; send fewer")
 
 
 def stopping() -> Problem:
-    """The problem of a request that arrives while the service stops."""
+    """Make the problem for a request that arrives while the service stops."""
     return Problem(NOT_READY, "the service stops or restarts; try again on a new connection")
 
 
 def small_chunks(size: int) -> Problem:
-    """The problem of a body in hundreds of chunks that are smaller than `size` bytes."""
+    """Make the problem for a body in hundreds of chunks that are smaller than `size` bytes."""
     return Problem(
         BODY_TOO_LARGE, f"the body has many chunks of less than {size} bytes; send larger ones"
     )
 
 
 def too_many_requests(what: str) -> Problem:
-    """The problem of requests sent without waiting for the replies to earlier ones."""
+    """Make the problem for requests sent without waiting for earlier replies; `what` is the
+    limit."""
     return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
 
 
 def too_slow(part: str, limit_s: float) -> Problem:
-    """The problem of a part of a request that missed its deadline of `limit_s`."""
+    """Make the problem for a part of a request ("headers", "body") not complete after `limit_s`."""
     return Problem(TOO_SLOW, f"the {part} did not arrive within {limit_s:g} s")
 
 
 def members(type_uri: str, title: str, status: int, detail: str) -> dict[str, Any]:
-    """The members that every problem has, by name."""
+    """Return the members that every problem has, by name."""
     return {"type": type_uri, "title": title, "status": status, "detail": detail}
 
 
 def with_error(content: dict[str, Any], path: str) -> dict[str, Any]:
-    """`content`, the members of a problem; for a `path` below /v2 also with the member `error`,
-    which the Open Inference Protocol requires."""
+    """Return `content`, the members of a problem; for a `path` below /v2 also with the member
+    `error`, which the Open Inference Protocol requires."""
     if path == "/v2" or path.startswith(("/v2/", "/v2?")):
         return {**content, "error": content["detail"]}
     return content

@@ -28,7 +28,7 @@ class Reply(NamedTuple):
 
 
 def problem_reply(problem: Problem, *headers: Header, path: str = "") -> Reply:
-    """The reply to a request for `path` that states `problem`, with additional `headers`."""
+    """Make the reply with `problem` to a request for `path`, with additional `headers`."""
     fields = (problem.type, problem.detail, problem.retry_after_ms)
     own_headers, body = _encode_problem(*fields, path[:4])
     return Reply(problem.type.status, [*own_headers, *headers], body)
@@ -45,7 +45,7 @@ def _encode_problem(
 
 
 def encode_head(reply: Reply, *extra: Header) -> bytes:
-    """The bytes of a reply's status line and headers in HTTP/1.1; `extra` headers come first."""
+    """Encode a reply's status line and headers in HTTP/1.1; `extra` headers come first."""
     return b"%b%b%bcontent-length: %d\r\n\r\n" % (
         STATUS_LINES[reply.status],
         b"".join(map(_format_header, extra)),

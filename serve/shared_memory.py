@@ -3,14 +3,14 @@
 Cells are 64-bit words. A word is written in one instruction, so a reader gets the old or the new
 value, never a mixture; there are no locks. The parts of the memory, in this order:
 
-    head            HEAD_WORDS unsigned integers; the supervisor writes them
-    worker blocks   WORKER_WORDS floats each; one worker owns and writes each block
-    stream table    STREAM_ENTRIES x (key, newest time stamp in ns), unsigned; all workers write
-    client table    CLIENT_ENTRIES x (key, remaining tokens, time of the last update in s), floats;
+    head            8 unsigned integers; the supervisor writes them
+    worker blocks   256 floats each; one worker owns and writes each block
+    stream table    1024 x (key, newest time stamp in ns), unsigned; all workers write
+    client table    1024 x (key, remaining tokens, time of the last update in s), floats;
                     all workers write
 
-Both tables are hash tables with open addressing: a key is in one of `PROBES` consecutive entries,
-which start at its hash.
+Both tables are hash tables with open addressing: a key is in one of 8 consecutive entries, which
+start at its hash.
 """
 
 import mmap
@@ -41,7 +41,10 @@ HEARTBEAT_TIMEOUT_S = 1.0  # a worker with an older heartbeat counts as dead
 
 @dataclass(frozen=True)
 class SharedMemory:
-    """The memory of a service with `blocks` worker blocks; `fd` is its file descriptor."""
+    """The memory of a service with `blocks` worker blocks; `fd` is its file descriptor.
+
+    The methods return views of its parts; writing to a view writes to the memory.
+    """
 
     fd: int
     blocks: int
@@ -53,20 +56,21 @@ class SharedMemory:
         return max(1, self.blocks - 1)
 
     def head(self) -> "memoryview[int]":
-        """The head: unsigned integers (HEAD_WORDS,)."""
+        """Return the head: unsigned integers (8,)."""
         return self._words(0, HEAD_WORDS).cast("Q")
 
     def worker(self, block: int) -> "memoryview[float]":
-        """The worker block with number `block`: floats (WORKER_WORDS,)."""
+        """Return the worker block with number `block`: floats (256,)."""
         return self._words(HEAD_WORDS + block * WORKER_WORDS, WORKER_WORDS).cast("d")
 
     def streams(self) -> "memoryview[int]":
-        """The stream table: unsigned integers (STREAM_ENTRIES * STREAM_WORDS,)."""
+        """Return the stream table: unsigned integers (2048,), a key and a time stamp for each
+        entry."""
         first = HEAD_WORDS + self.blocks * WORKER_WORDS
         return self._words(first, STREAM_ENTRIES * STREAM_WORDS).cast("Q")
 
     def clients(self) -> "memoryview[float]":
-        """The client table: floats (CLIENT_ENTRIES * CLIENT_WORDS,)."""
+        """Return the client table: floats (3072,), a key, tokens and a time for each entry."""
         first = HEAD_WORDS + self.blocks * WORKER_WORDS + STREAM_ENTRIES * STREAM_WORDS
         return self._words(first, CLIENT_ENTRIES * CLIENT_WORDS).cast("d")
 
@@ -118,18 +122,19 @@ class WorkerPeers:
             self._own[cell] = 0.0
 
     def other_connections(self) -> list[int]:
-        """The number of open connections of each other live worker."""
+        """Return the number of open connections of each other live worker."""
         return [int(cells[CONNECTIONS]) for cells in self._live()]
 
     def ask_for_room(self, least: int) -> None:
         """Ask the worker with the most connections to end a connection of a client that has at
-        least `least` connections."""
+        least `least` connections. The worker reads this with `room_asked`."""
         self._own[ROOM_FOR] = least
         self._own[ROOM_ASKED] += 1
 
     def room_asked(self) -> int | None:
-        """The smallest `least` of the other workers' requests for room since the last call. None
-        without a request, and if another worker has more connections than this one."""
+        """Return the smallest `least` that other workers have passed to `ask_for_room` since the
+        last call here; None if there was no request, or if another worker has more connections and
+        must act."""
         before, self._room_asked = self._room_asked, [cells[ROOM_ASKED] for cells in self._others]
         if self._own[CONNECTIONS] < max(self.other_connections(), default=0):
             return None

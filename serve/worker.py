@@ -44,7 +44,7 @@ class SupervisorConnection:
             yield from (line.decode() for line in lines)
 
     def send(self, **message: Any) -> None:
-        """Send a message; no effect if the supervisor has ended."""
+        """Send the keyword arguments as a JSON message; no effect if the supervisor has ended."""
         with self._lock:
             try:
                 self._socket.sendall(json.dumps(message).encode() + b"\n")
