@@ -146,7 +146,7 @@ the array causes atomic operations, which take longer than the arithmetic of a s
 
 def inlined(function: Function) -> Function:
     """Compile a small function of a hot loop with numba. Its machine code is copied into the code
-    of each compiled caller, so that no arrays are passed."""
+    of each compiled caller, which saves the call and the passing of arrays."""
     return _compiled(function, nogil=False, forceinline=True)
 
 

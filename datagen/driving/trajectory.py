@@ -42,7 +42,8 @@ class Course:
     curvature: FloatArray  # 1/m, relative to the road
 
     def at(self, driven_m: float) -> tuple[float, float, float]:
-        """Offset (m), slope (m/m) and curvature (1/m) after `driven_m` metres, interpolated."""
+        """Return offset (m, left positive), slope (m/m) and curvature (1/m) after `driven_m`
+        metres, interpolated between the two nearest metres."""
         count = len(self.offset)
         cell = int(driven_m)
         part = driven_m - cell

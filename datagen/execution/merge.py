@@ -36,8 +36,8 @@ from runtime.files import file_hash
 
 @dataclass(frozen=True, slots=True)
 class MergeResult:
-    """Result of a merge: `rounds` of the `planned` rounds are in the folder `out` now; `added` of
-    them were copied by this merge. `frames` counts all frames in `out`."""
+    """Result of a merge into `out`: the plan has `planned` rounds, `rounds` of which are in `out`
+    now; this merge copied `added` rounds. `frames` counts all frames in `out`."""
 
     rounds: int
     planned: int

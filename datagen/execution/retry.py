@@ -28,8 +28,9 @@ class Timeouts:
     """Delay before the second attempt. The delay before the third attempt is four times as long."""
 
     def deadline(self, job: Job | None, started: float, last_heartbeat: float) -> float:
-        """Monotonic time (s) at which a process that records `job` since `started` is stopped;
-        infinite without a job."""
+        """Return the time (s) at which a process is stopped that records `job` since `started`, and
+        whose last message arrived at `last_heartbeat`; infinite without a job. All times are
+        monotonic."""
         if job is None:
             return float("inf")
         round_s = self.round_start_s + self.frame_s * job.plan.frames
@@ -79,7 +80,8 @@ class RetryQueue:
         return None
 
     def next_at(self) -> float:
-        """Monotonic time (s) of the earliest next attempt; infinite if no round waits."""
+        """Return the monotonic time (s) of the earliest next attempt; infinite if no round
+        waits."""
         return min((not_before for not_before, _ in self._waiting), default=float("inf"))
 
     def record_outcome(self, job: Job, outcome: Outcome) -> None:

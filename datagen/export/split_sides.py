@@ -33,8 +33,8 @@ class Side:
 
 
 def sides(dataset: Dataset, split: str) -> list[Side]:
-    """The sides that have rounds; only the side `split` unless it is "all". Raises DatasetError if
-    there is no round."""
+    """Return the sides that have rounds; only the side `split` unless it is "all". Raises
+    DatasetError if there is no round."""
     chosen = dataset.select(split).rounds
     found = [
         Side(name or NO_SIDE, tuple(info for info in chosen if info.split == name))

@@ -27,7 +27,7 @@ MAX_ROUNDS = SEEDS_PER_PLAN // 2
 
 
 def all_lights() -> tuple[str, ...]:
-    """Names of all lighting conditions of the camera simulation."""
+    """Return the names of all lighting conditions of the camera simulation."""
     from simulator.camera import KINDS  # here, because help texts are printed without the simulator
 
     return KINDS

@@ -27,7 +27,8 @@ PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FIL
 
 @dataclass(frozen=True, slots=True)
 class RoundState:
-    """Size and hashes of a finished round file; later changes of the file are detected by them."""
+    """Size and hashes of a finished round file, with which later changes of the file are
+    detected."""
 
     id: str
     file: str
@@ -107,12 +108,14 @@ def require_merged(folder: Path) -> None:
 
 
 def round_path(folder: Path, round_id: str) -> Path:
-    """Path of the file of a finished round. Raises BadName if the id cannot be a file name."""
+    """Return the path of the file of a finished round. Raises BadName if the id cannot be a file
+    name."""
     return folder / "rounds" / f"{require_name(round_id, 'round id')}.mcap"
 
 
 def state_path(folder: Path, round_id: str) -> Path:
-    """Path of the file with the hashes of a finished round. Raises BadName."""
+    """Return the path of the file with the hashes of a finished round. Raises BadName if the id
+    cannot be a file name."""
     return folder / "state" / f"{require_name(round_id, 'round id')}.json"
 
 

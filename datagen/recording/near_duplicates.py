@@ -64,7 +64,8 @@ def find_near_duplicates(
     other: NDArray[np.bool_],
     tolerances: Tolerances,
 ) -> NearDuplicates:
-    """Find near-duplicates of the frames in mask `side` (N,) among those in mask `other` (N,).
+    """Find near-duplicates of the frames in mask `side` (N,) among those in mask `other` (N,),
+    where N is the number of frames in `labels`, the labels of `rounds`.
 
     Pairs across the start line are not found, because `s` jumps there from the lap's length to 0.
     """

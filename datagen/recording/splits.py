@@ -45,7 +45,7 @@ class Split:
     """Rounds on any side that were recovered from damaged files and are used nevertheless."""
 
     def side(self, round_id: str) -> str:
-        """The side of a round; empty if it is on none."""
+        """Return the name of the side that the round is on; empty if it is on none."""
         return next((side for side in SIDES if round_id in getattr(self, side)), "")
 
 

@@ -102,16 +102,16 @@ class Contents:
         return " ".join(t.text for t in self.steps.message(ANNOTATIONS, number).texts)
 
     def pose(self, number: int, child: str = EGO) -> Pose:
-        """Pose of the coordinate frame `child` in its parent at step `number`; by default, of the
-        car in the world. Raises DatasetError if it was not recorded."""
+        """Read the pose of the coordinate frame `child` in its parent at step `number`; by default,
+        of the car in the world. Raises DatasetError if it was not recorded."""
         for transform in self.steps.message(TRANSFORMS, number).transforms:
             if transform.child_frame_id == child:
                 return Pose(_vector(transform.translation), _quaternion(transform.rotation))
         raise DatasetError(f"{self.steps.index.path}: no transform of {child} in step {number}")
 
     def boxes(self, number: int, frame: str = WORLD) -> list[Box]:
-        """Boxes of the other cars in the world frame at step `number`. With `frame` EGO: the box of
-        the car itself."""
+        """Read the boxes of the other cars in the world frame at step `number`. With `frame` EGO:
+        the box of the car itself."""
         entities = self.steps.message(TRAFFIC, number).entities
         return [
             Box(Pose(_vector(c.pose.position), _quaternion(c.pose.orientation)), _vector(c.size))

@@ -298,7 +298,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self.close_with(self._fault or Problem(MALFORMED, detail))
 
     def give_way(self) -> None:
-        """Close an idle connection after its unsent bytes; abort a connection in another phase."""
+        """Make room for a new connection: close if idle (after the unsent bytes), else abort."""
         idle = self._phase is Phase.IDLE
         self._phase, self._deadline_s = Phase.CLOSING, self.guard.clock() + guards.LINGER_S
         (self.transport.close if idle else self.transport.abort)()

@@ -100,8 +100,8 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
 
 
 def default_out(file: Path) -> Path:
-    """Default path of the recovered round: beside `file`, or in `recovered/` of the dataset if
-    `file` is one of its rounds."""
+    """Return the default path of the recovered round: beside `file`, or in `recovered/` of the
+    dataset if `file` is one of its rounds."""
     if file.parent.name == ROUNDS:
         return file.parent.parent / "recovered" / file.name
     return file.with_name(f"{file.stem}.recovered.mcap")

@@ -17,8 +17,8 @@ DOUBLE_TAG_1, DOUBLE_TAG_2 = 1 << 3 | 1, 2 << 3 | 1
 
 
 def bytes_field(message: memoryview, number: int) -> memoryview:
-    """Content of the first length-delimited field with number `number` in `message`. Raises
-    ValueError if there is none."""
+    """Return the content of the first length-delimited field with number `number` in `message`.
+    Raises ValueError if there is none."""
     for start, end in bytes_fields(message, number):
         return message[start:end]
     raise ValueError(f"the message is damaged: field {number} was not found")
