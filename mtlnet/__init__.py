@@ -17,7 +17,10 @@ __all__ = ["Features", "Model", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the interface when it is used: `import mtlnet` alone loads neither numpy nor torch."""
+    """Import `Features`, `Model` or `load` from `mtlnet.api` at its first use and return it.
+
+    So `import mtlnet` alone loads neither numpy nor torch. Raises AttributeError for another name.
+    """
     if name not in __all__:
         raise AttributeError(f"module 'mtlnet' has no attribute {name!r}")
     from mtlnet import api

@@ -39,9 +39,13 @@ class LabelFolder:
     """A folder with pictures. A picture is addressed by its index in the fixed list `files`."""
 
     def __init__(self, folder: Path, camera_file: Path | None, model: CameraParameters) -> None:
-        """Read the folder. `camera_file`: the camera of pictures without their own; it is copied
-        into the folder if it has none. `model`: the camera whose values replace missing values of a
-        camera file. Raises UserError."""
+        """Find the pictures in `folder` and its subfolders, and check `labels.csv`.
+
+        `camera_file`: camera of the pictures whose row names no camera; the file is copied into a
+        folder that has no camera file. `model`: camera of the model, whose values replace values
+        that are missing in a camera file. Raises UserError for a folder without pictures or camera,
+        a faulty `labels.csv`, and a camera file that differs from the file in the folder.
+        """
         if not folder.is_dir():
             raise UserError(f"there is no folder {folder}; give one with pictures")
         self.folder = folder.resolve()
@@ -83,9 +87,10 @@ class LabelFolder:
         return sorted(found, key=natural_key)
 
     def rows(self) -> dict[str, Cells]:
-        """Return the rows of `labels.csv` by picture file; empty without a `labels.csv`.
+        """Return the rows of `labels.csv`, each a dict from column to text, by the name of the
+        picture's file; an empty dict if there is no `labels.csv`.
 
-        They are read again when the file has changed; do not change the returned dictionary.
+        The file is read again when it has changed. Do not change the returned dictionary.
         """
         path = self.folder / LABELS
         if not path.is_file():
@@ -96,9 +101,11 @@ class LabelFolder:
         return self._rows[1]
 
     def picture(self, number: int) -> NDArray[np.uint8]:
-        """Read the whole picture, uint8 RGB (H, W, 3), read-only. Raises UserError.
+        """Return picture `number` as a read-only uint8 RGB array (H, W, 3). Raises UserError for a
+        file that cannot be read or is not in the folder.
 
-        The last picture stays in memory, because each drag of a marking needs it again.
+        The picture that was read last stays in memory, because each drag of a marking needs it
+        again.
         """
         path = self.folder / self.files[number]
         if not path.resolve().is_relative_to(self.folder):
@@ -112,7 +119,10 @@ class LabelFolder:
 
     def camera(self, number: int, width: int, height: int) -> CameraParameters:
         """Return the camera of picture `number`, resized to the picture's width and height (px).
-        Raises UserError."""
+
+        Its pitch is the pitch in the picture's row, if the row has one. Raises UserError for a
+        faulty camera file, and for a camera with another aspect ratio.
+        """
         row = self.rows().get(self.files[number], {})
         name = row.get("camera") or CAMERA_FILE
         path = self.folder / name
@@ -129,7 +139,8 @@ class LabelFolder:
         return camera.resized(width, height)
 
     def markings(self, number: int, camera: CameraParameters) -> Markings | None:
-        """Return the label of a picture; None if it has no label, or a label without a lane."""
+        """Return the label of picture `number`, which `camera` took; None if the picture has no
+        label, or if its label does not have the distances to both markings of a lane."""
         row = self.rows().get(self.files[number], {})
         texts = {name: row.get(name) for name in ("ml", "mr", "l", "m", "r")}
         known = {
@@ -143,10 +154,12 @@ class LabelFolder:
         return Markings(*sides, float(row["angle"]), curvature, camera.pitch_deg)
 
     def save(self, number: int, markings: Markings, heading: str, texts: Cells) -> Cells:
-        """Write the label of a picture; returns its row. `texts`: `drive` and `light`, if given.
+        """Write the label of picture `number` into `labels.csv`, and return its row of the file.
 
-        If `heading` (the class) is empty, it is derived from the curvature, so the markings must
-        have been drawn 20 m ahead. Raises UserError for a label out of range.
+        `heading` is the class of the road; if it is empty, the class follows from the curvature of
+        the markings, which must then be correct 20 m ahead. `texts`: the cells of the columns
+        `drive` and `light`; a column that is missing in `texts` keeps its value. Raises UserError
+        for a label out of range.
         """
         if not heading:
             bend = "left" if markings.curvature > 0 else "right"

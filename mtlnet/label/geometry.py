@@ -1,7 +1,8 @@
 """Computes distances, angle and curvature of a lane's two markings from points in a picture.
 
-Flat road, parallel markings: in the track frame at the car, a marking `d` m to the right lies at
-left = curvature * along^2 / 2 - d. Pixels of the whole picture: u right, v down.
+The road is assumed to be flat and the markings parallel. In the track frame at the car (x along the
+road, y to the left, both in m) a marking `d` m to the right is at y = curvature * x^2 / 2 - d. A
+pixel [u, v] of the whole picture has u to the right and v down.
 """
 
 from dataclasses import dataclass, replace
@@ -52,12 +53,13 @@ def fit_markings(
     curvature: float | None = 0.0,
     pitch_deg: float | None = None,
 ) -> Markings:
-    """Fit the markings to points on the left and on the right marking, each (N, 2), px of the
-    camera's pictures, by least squares of the points' lateral distances, converted to px.
+    """Fit a lane's markings to points on the left and on the right marking, each (N, 2) in px of
+    the pictures of `camera`, and return them. The fit minimises the squares of the points' lateral
+    distances from the markings, converted to px.
 
-    With `curvature` None the curvature is fitted too, from a third point on either marking. With
-    `pitch_deg` None the pitch is fitted too, from the point where the markings would meet. Raises
-    MarkingsError.
+    `curvature` is in 1/m; with None it is fitted too, which needs a third point on either marking.
+    `pitch_deg` is the camera's pitch in degrees; with None it is fitted too, from the point where
+    the markings would meet. Raises MarkingsError.
     """
     points = [np.asarray(side, np.float64).reshape(-1, 2) for side in (left, right)]
     if min(map(len, points)) < 2:
@@ -188,9 +190,11 @@ def marking_pixels(
 
 
 def handles(camera: CameraParameters, markings: Markings) -> dict[str, list[list[float]]]:
-    """Return, for "left" and "right", the pixels [u, v] of the near, middle and far handle.
+    """Return the points by which a user drags the markings: for "left" and "right" three pixels
+    [u, v], near, middle and far (at most 25 m away).
 
-    Where a marking leaves the picture, its handles lie at the picture's edge.
+    Where a marking leaves the picture, its points lie near the picture's edge. Raises MarkingsError
+    for markings behind the camera.
     """
     size = np.array([camera.width - 1, camera.height - 1], np.float64)
     found = {}

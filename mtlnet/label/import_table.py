@@ -38,7 +38,8 @@ CAMERAS = "cameras"
 
 @dataclass(frozen=True)
 class LabelStd:
-    """Standard deviations of the labels of the files that match `pattern`."""
+    """Standard deviations of the labelled distances (`metres`) and angles (`radians`) in the files
+    whose names match the wildcard `pattern`."""
 
     pattern: str
     metres: float
@@ -46,8 +47,9 @@ class LabelStd:
 
 
 def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
-    """Parse texts such as "0.06,0.006" and "night_*=0.16,0.012", the values of --label-std. Raises
-    UserError."""
+    """Parse the values of --label-std, for example "0.06,0.006" (all files) and
+    "night_*=0.16,0.012" (files that match the pattern). The numbers are the standard deviations in
+    m and rad. Raises UserError for any other form."""
     found = []
     for text in texts:
         pattern, _, numbers = text.rpartition("=")

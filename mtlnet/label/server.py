@@ -64,7 +64,8 @@ Text = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f]*$")]
 
 
 class Drag(BaseModel):
-    """The body of a request to fit markings: handles of both markings, px of the whole picture."""
+    """The body of a request to fit markings: 2 to 8 points [u, v] on each marking, in px of the
+    whole picture."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -77,7 +78,8 @@ class Drag(BaseModel):
 
 
 class Label(BaseModel):
-    """The body of a request to save a picture's label; m, rad, 1/m and degrees."""
+    """The body of a request to save a picture's label: `ml` and `mr` in m, `angle` in rad,
+    `curvature` in 1/m, `pitch_deg` in degrees; `heading` is "" if it follows from the curvature."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -92,16 +94,19 @@ class Label(BaseModel):
 
 
 class Labeller:
-    """Answers of a model and labels made by hand, for the pictures of a folder."""
+    """Answers the page's requests: lists and shows the pictures of a folder, and computes markings
+    from a label, a model or dragged points."""
 
     def __init__(self, folder: LabelFolder, engine: Engine | None) -> None:
-        """Use the model of `engine`; with None there are no answers of a model."""
+        """Label the pictures of `folder`. The model of `engine` proposes markings; with None it
+        does not, and pictures without a label start with the markings of a usual lane."""
         self.folder = folder
         self._engine = engine
         self._lock = Lock()  # an engine takes one picture at a time
 
     def listing(self) -> dict[str, Any]:
-        """Return the folder's name, and for each picture its name and whether it is labelled."""
+        """Return the folder's name (`folder`), and for each picture its name and whether it has a
+        label (`pictures`, a list of dicts with the keys `file` and `labelled`)."""
         rows = self.folder.rows()
         files = [
             {"file": name_as_text(name), "labelled": name in rows} for name in self.folder.files
@@ -109,8 +114,13 @@ class Labeller:
         return {"folder": name_as_text(self.folder.folder.name), "pictures": files}
 
     def picture(self, number: int) -> dict[str, Any]:
-        """Return size, row, lines and handles of a picture. The lines are those of its label; else
-        of the model's answer; else of the usual lane."""
+        """Return what the page shows for picture `number`: name, size in px, row of `labels.csv`,
+        and the markings with their lines and handles in px (`shown`).
+
+        The markings are those of the label; without a label the markings that the model finds;
+        without either, the markings of a lane 3.6 m wide with the car in its middle. `source`
+        states which.
+        """
         image = self.folder.picture(number)
         height, width = image.shape[:2]
         camera = self.folder.camera(number, width, height)
@@ -150,7 +160,7 @@ class Labeller:
         return Markings(*sides, found.angle_rad, 0.0, camera.pitch_deg), note
 
     def shown_jpeg(self, number: int) -> bytes:
-        """Return the picture as JPEG; its longer side is at most `MAX_SHOWN_PX` px."""
+        """Return picture `number` as JPEG, reduced so that its longer side is at most 1600 px."""
         image = self.folder.picture(number)
         scale = min(1.0, MAX_SHOWN_PX / max(image.shape[:2]))
         if scale < 1:
@@ -159,7 +169,8 @@ class Labeller:
         return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=90))
 
     def fit(self, number: int, drag: Drag) -> dict[str, Any]:
-        """Return the markings through the dragged handles, as `shown` does. Raises UserError."""
+        """Fit markings to the dragged points `drag` in picture `number`, and return them as JSON
+        values with their lines and handles in px (`shown`). Raises UserError if no markings fit."""
         height, width = self.folder.picture(number).shape[:2]
         camera = self.folder.camera(number, width, height)
         found = fit_markings(camera, drag.left, drag.right, drag.curvature, drag.pitch_deg)
@@ -167,7 +178,8 @@ class Labeller:
 
 
 def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:
-    """Convert markings for JSON: their values, and lines and handles in px of the picture."""
+    """Convert markings to JSON values: a dict with the `markings` (m, rad, 1/m, degrees), and for
+    "left" and "right" the pixels [u, v] of the `lines` to draw and of the `handles` to drag."""
     lines = {}
     for side, pixels in zip(("left", "right"), marking_pixels(camera, markings), strict=True):
         seen = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e5).all(1)]
