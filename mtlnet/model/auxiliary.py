@@ -1,10 +1,11 @@
 """Auxiliary heads and loss of a network with heads over bins, used only in training.
 
-The first head predicts the image columns in which the markings of the car's lane cross the image
-rows `ROWS`. It is a 1 x 1 convolution of the grid, with a softmax over the grid's columns for each
-marking and row; a label is split between two neighbouring columns. The second head predicts the
-curvature of the road at the distances `AHEAD_M` in front of the car from the last shared features,
-with a softmax over bins for each distance. The columns make the network keep small details of the
+The first head predicts the image columns in which the two markings of the car's lane cross ten
+image rows (`ROWS`). It is a 1 x 1 convolution of the grid, with a softmax over the grid's columns
+for each marking and row. The target distribution of an image column divides the probability between
+the two nearest columns of the grid. The second head predicts the curvature of the road at eight
+distances from 0 to 40 m in front of the car (`AHEAD_M`) from the last shared features, with a
+softmax over 41 bins for each distance. The columns make the network keep small details of the
 image, and the curvature makes it see where a bend begins. `mtlnet.data.road_ahead` computes the
 labels; unknown labels add no loss.
 """
@@ -29,7 +30,8 @@ radius. The bins have equal widths in the root."""
 
 
 class AuxiliaryHeads(nn.Module):
-    """The heads of the columns and of the curvatures. `size`: number of last shared features."""
+    """The heads that predict the markings' image columns and the road's curvatures for the network
+    `plan`. `size`: number of last shared features."""
 
     def __init__(self, plan: Architecture, size: int) -> None:
         super().__init__()
@@ -41,8 +43,9 @@ class AuxiliaryHeads(nn.Module):
         """Index of the grid row that contains each image row of `ROWS`."""
 
     def forward(self, grid: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores of columns (B, 2, ROWS, w) and curvatures (B, AHEAD_M, CURVATURES), from a grid
-        (B, C, h, w) and last shared features (B, F)."""
+        """Compute scores, before the softmax, of the columns of 2 markings in 10 rows
+        (B, 2, 10, w), and of 8 curvatures (B, 8, 41), from the features of the last convolution
+        `grid` (B, C, h, w) and the last shared features `x` (B, F)."""
         with torch.autocast(grid.device.type, enabled=False):
             places = self.columns(grid.float())
             places = places.view(len(grid), SIDES, len(ROWS), *grid.shape[2:])
@@ -52,10 +55,10 @@ class AuxiliaryHeads(nn.Module):
 
 
 def auxiliary_loss(scores: tuple[Tensor, Tensor], labels: Tensor) -> Tensor:
-    """Weighted sum () of the cross-entropies of columns and curvatures.
+    """Compute the weighted sum of the cross-entropies of columns and curvatures, a scalar.
 
-    `scores`: the result of `AuxiliaryHeads`. `labels` (B, LABELS): image columns in px, those of
-    the left marking first, then curvatures in 1/m; NaN where unknown.
+    `scores`: the result of `AuxiliaryHeads`. `labels` (B, 28): for each image 10 image columns in
+    px of the left marking and 10 of the right, then 8 curvatures in 1/m; NaN where unknown.
     """
     columns, curvature = scores
     places = labels[:, : -len(AHEAD_M)].reshape(-1, SIDES, len(ROWS))
@@ -69,8 +72,9 @@ def auxiliary_loss(scores: tuple[Tensor, Tensor], labels: Tensor) -> Tensor:
 
 
 def split_columns(places: Tensor, count: int) -> Tensor:
-    """Distributions (..., count) over the grid's `count` columns for image columns `places` (...)
-    in px; each is split between the two grid columns whose centres enclose it."""
+    """Convert image columns `places` (...) in px to target distributions (..., count) over the
+    `count` columns of the grid. A distribution is divided between the two grid columns whose
+    centres enclose the image column."""
     at = (places.nan_to_num() * (count / WIDTH) - 0.5).clamp(0, count - 1)
     number = torch.arange(count, dtype=at.dtype, device=at.device)
     return (1 - (at[..., None] - number).abs()).clamp_min(0)

@@ -1,11 +1,11 @@
 """Distributions over bins for distances and angle: the targets, and the answer from the scores.
 
-A distance is a softmax over `DISTANCE_BINS` bins of its range (`trackfeatures.RANGES`) and a class
-"absent"; the angle is a softmax over `ANGLE_BINS` bins. The target of a value is a normal
-distribution around it, integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al.
-2024). The answer is the expectation over the bins within `NEAR` of the likeliest bin. Where a
-distance jumps from one marking to the next, a regression would answer with a value in between; a
-distribution has two peaks, and the answer is at the higher one.
+A distance is a softmax over 70 bins of its range (`trackfeatures.RANGES`) and a class "absent"; the
+angle is a softmax over 100 bins. The target of a value is a normal distribution around it,
+integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al. 2024). The answer is
+the expectation over the likeliest bin and the 4 bins on each side of it. Where a distance jumps
+from one marking to the next, a regression would answer with a value in between; a distribution has
+two peaks, and the answer is at the higher one. `DISTANCE_BINS` is 70, `ANGLE_BINS` 100.
 
 The functions are torch operations without branches, so that they can be part of an exported
 network.
@@ -31,7 +31,8 @@ _SPANS = [tf.RANGES[name] for name in tf.TARGETS]
 
 @dataclass(frozen=True)
 class Scores:
-    """The outputs of the heads for B images, before softmax."""
+    """The outputs of the heads for B images, before the softmax: `distance` (B, 5, 71), whose last
+    column is "absent"; `angle` (B, 100); `heading` (B, 3)."""
 
     distance: Tensor  # (B, 5, DISTANCE_BINS + 1), the last "absent"
     angle: Tensor  # (B, ANGLE_BINS)
@@ -39,14 +40,17 @@ class Scores:
 
 
 def split_scores(distance: Tensor, angle: Tensor, heading: Tensor) -> Scores:
-    """Scores from the heads' outputs (B, 5 * (DISTANCE_BINS + 1)), (B, ANGLE_BINS) and (B, 3)."""
+    """Make Scores from the outputs of the heads: `distance` (B, 5 * 71), `angle` (B, 100) and
+    `heading` (B, 3)."""
     return Scores(distance.reshape(-1, len(tf.MARKINGS), DISTANCE_BINS + 1), angle, heading)
 
 
 def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tensor:
-    """Target probabilities (..., `count`) of equal bins between `low` and `high` for values (...).
+    """Compute the target probabilities (..., `count`) of `count` equal bins between `low` and
+    `high` for values (...): a normal distribution around each value, with a standard deviation of
+    one bin.
 
-    Values are clipped to the range; the distribution is truncated to it.
+    Values are clipped to the range, and the distribution is truncated to it.
     """
     width = (high - low) / count
     edges = torch.linspace(low, high, count + 1, dtype=values.dtype, device=values.device)
@@ -57,8 +61,8 @@ def normal_targets(values: Tensor, low: float, high: float, count: int) -> Tenso
 
 
 def bin_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
-    """Target distributions (B, 5, DISTANCE_BINS + 1) of the distances and (B, ANGLE_BINS) of the
-    angle, for coded targets (B, 6)."""
+    """Compute the target distributions of the distances (B, 5, 71) and of the angle (B, 100) for
+    coded targets (B, 6)."""
     values = _decoded(coded)
     absent = absent_in(coded)
     each = []
@@ -72,7 +76,7 @@ def bin_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def absent_in(coded: Tensor) -> Tensor:
-    """Whether each distance of coded targets (B, 6) is absent: (B, 5) bool.
+    """Return whether each distance of coded targets (B, 6) is absent, bool (B, 5).
 
     A label codes an absent marking as one end of its range (`inactive` in `trackfeatures.RANGES`);
     a marking that is present never reaches that end.
@@ -89,11 +93,11 @@ thousandth of it; the code of a present marking differs from the code of absence
 
 
 def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
-    """Coded answers (B, 6): five distances and the angle, from the scores (B, 5, DISTANCE_BINS + 1)
-    and (B, ANGLE_BINS).
+    """Compute the coded answers (B, 6), five distances and the angle, from the scores of the
+    distances (B, 5, 71) and of the angle (B, 100).
 
-    A distance whose probability of absence exceeds `ABSENT_ABOVE` has the code of an absent
-    marking, as in a label.
+    A distance whose probability of absence exceeds its limit (`ABSENT_ABOVE`, 0.54 or 0.75) gets
+    the code of an absent marking, as in a label.
     """
     absent = absent_probabilities(distance)
     found = expectation(distance[:, :, :-1])  # in [0, 1] of the range
@@ -105,9 +109,10 @@ def read_scores(distance: Tensor, angle: Tensor) -> Tensor:
 
 
 def absent_probabilities(distance: Tensor) -> Tensor:
-    """Probabilities (B, 5) that each marking is absent, from scores (B, 5, DISTANCE_BINS + 1).
+    """Compute the probability that each marking is absent (B, 5) from the scores `distance`
+    (B, 5, 71), whose last column is "absent".
 
-    `ml` and `mr` are always absent together, so both get the mean of their probabilities.
+    `ml` and `mr` are always absent together, so both get the mean of their two probabilities.
     """
     absent = torch.softmax(distance, 2)[:, :, -1]
     pair = absent[:, PAIR].mean(1, keepdim=True).expand(-1, 2)
@@ -115,9 +120,9 @@ def absent_probabilities(distance: Tensor) -> Tensor:
 
 
 def expectation(scores: Tensor) -> Tensor:
-    """Expected values (...) in [0, 1], the share of the range, from the scores (..., count) of its
-    bins. Only the bins within `NEAR` of the likeliest bin are included.
-    """
+    """Compute expected values (...) from the scores (..., count) of `count` bins. A value is a
+    share of the bins' range, in [0, 1]. Only the likeliest bin and the 4 bins on each side of it
+    are included."""
     count = scores.shape[-1]
     number = torch.arange(count, dtype=torch.float32, device=scores.device)
     best = scores.argmax(-1, keepdim=True).to(torch.float32)
@@ -127,8 +132,8 @@ def expectation(scores: Tensor) -> Tensor:
 
 
 def log_spreads(distance: Tensor, angle: Tensor) -> Tensor:
-    """Logarithms (B, 6) of the standard deviations, in bins, of the distributions that the scores
-    (B, 5, DISTANCE_BINS + 1) and (B, ANGLE_BINS) define.
+    """Compute the logarithms (B, 6) of the standard deviations, in bins, of the distributions that
+    the scores of the distances (B, 5, 71) and of the angle (B, 100) define.
 
     All bins except "absent" are included, so that two separate peaks give a large value.
     """
@@ -145,7 +150,8 @@ def _log_spread(scores: Tensor) -> Tensor:
 
 
 def soft_cross_entropy(scores: Tensor, targets: Tensor) -> Tensor:
-    """Cross-entropy (...) of scores (..., count) for target distributions (..., count)."""
+    """Compute the cross-entropy (...) of scores (..., count) for target distributions
+    (..., count)."""
     return -(targets * log_softmax(scores, -1)).sum(-1)
 
 

@@ -51,8 +51,8 @@ CODED_HEADS = (("distance", slice(0, 5)), ("angle", slice(5, 6)))
 class Network(nn.Module):
     """A network of the given architecture.
 
-    Recipe `fast` trains it with `batch_norm`, and with `target_mean` and `target_std` other than 0
-    and 1.
+    Recipe `fast` trains it with `batch_norm`, and with the mean and standard deviation of the coded
+    training targets in `target_mean` (6,) and `target_std` (6,); otherwise these are 0 and 1.
     """
 
     target_mean: Tensor
@@ -81,17 +81,19 @@ class Network(nn.Module):
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Outputs (B, 9) float32, six coded values and three class scores, for images (B, 210, 280,
-        3), uint8 or normalised float."""
+        """Compute the outputs (B, 9) float32, six coded values and three class scores, for images
+        (B, 210, 280, 3): uint8, or float with colours in [-1, 1]."""
         return self.forward_heads(self.forward_features(images))
 
     def forward_features(self, images: Tensor) -> Tensor:
-        """Last shared features (B, 256) of images: the input of the heads."""
+        """Compute the last shared features (B, 256), the input of the heads, for images
+        (B, 210, 280, 3)."""
         features: Tensor = self.shared(self.forward_grid(images).flatten(1))
         return features
 
     def forward_grid(self, images: Tensor) -> Tensor:
-        """Features (B, C, h, w) of the last convolution for images (B, 210, 280, 3)."""
+        """Compute the features of the last convolution, C channels of h x w px (B, C, h, w), for
+        images (B, 210, 280, 3)."""
         # `first_row` is counted from the bottom, because images may lack the unread rows above it.
         images = images[:, images.shape[1] - HEIGHT + self.architecture.first_row :]
         x = (normalise(images) if images.dtype == torch.uint8 else images).permute(0, 3, 1, 2)
@@ -99,7 +101,8 @@ class Network(nn.Module):
         return grid
 
     def forward_heads(self, x: Tensor) -> Tensor:
-        """Six coded values and three class scores (B, 9) for last shared features (B, 256)."""
+        """Compute six coded values and three class scores (B, 9) from last shared features
+        (B, 256)."""
         # float32 also under autocast: coded values differ little, and the heads are small.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
@@ -112,15 +115,17 @@ class Network(nn.Module):
             )
 
     def nine_outputs(self, x: Tensor) -> Tensor:
-        """Coded distances, coded angle and class probabilities (B, 9) for last shared features."""
+        """Compute five coded distances, the coded angle and three class probabilities (B, 9) from
+        last shared features (B, 256)."""
         outputs = self.forward_heads(x)
         return torch.cat([outputs[:, :6], torch.softmax(outputs[:, 6:], 1)], 1)
 
     def uncertainty_inputs(self, x: Tensor) -> Tensor:
-        """Inputs of the uncertainty head (B, `architecture.uncertainty_inputs`).
+        """Compute the inputs of the uncertainty head (B, 256), or (B, 262) for a network with heads
+        over bins, from last shared features (B, 256).
 
-        They are the last shared features x (B, 256) and, for heads over bins, the logarithms of the
-        distributions' standard deviations.
+        They are the last shared features and, for heads over bins, the logarithms of the standard
+        deviations of the six distributions.
         """
         if not self.architecture.bins:
             return x
@@ -128,20 +133,21 @@ class Network(nn.Module):
         return torch.cat([x.float(), log_spreads(scores.distance, scores.angle)], 1)
 
     def absent_probabilities(self, x: Tensor) -> Tensor:
-        """Probabilities (B, 5) that each marking is absent, from the last shared features (B, 256)
-        of a network with heads over bins."""
+        """Compute the probability that each marking is absent (B, 5) from the last shared features
+        (B, 256) of a network with heads over bins."""
         return absent_probabilities(self.forward_scores(x).distance)
 
     def forward_scores(self, x: Tensor) -> Scores:
-        """Scores of the heads, before softmax, for last shared features (B, 256) of a network with
-        heads over bins."""
+        """Compute the scores of the heads, before the softmax, from the last shared features
+        (B, 256) of a network with heads over bins."""
         with torch.autocast(x.device.type, enabled=False):
             each = [self.heads[name](x.float()) for name, _ in self.architecture.heads]
             return split_scores(*each)
 
 
 def normalise(images: Tensor) -> Tensor:
-    """uint8 colours of any shape, scaled to float32 in [-1, 1] as in the exported graph."""
+    """Scale uint8 colours 0 to 255, an array of any shape, to float32 in [-1, 1], as the exported
+    graph does."""
     return images.float() * (1 / 127.5) - 1.0
 
 
@@ -161,7 +167,8 @@ def initialise(network: Network, seed: int) -> None:
 
 
 def load_network(path: Path, name: str = MTL.name) -> Network:
-    """The network called `name`, in evaluation mode, with the weights in the file `path`."""
+    """Load the weights in the file `path` into the network called `name`, and return it in
+    evaluation mode."""
     network = Network(architecture=find_architecture(name))
     with utf8_path(path) as plain:
         network.load_state_dict(load_file(plain))
@@ -169,8 +176,8 @@ def load_network(path: Path, name: str = MTL.name) -> Network:
 
 
 def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Coded distances and angle, and class probabilities (B, 9) for uint8 images (B, 210, 280, 3),
-    computed in batches of `RUN_BATCH`."""
+    """Compute coded distances, coded angle and class probabilities (B, 9) for uint8 images
+    (B, 210, 280, 3), in batches of 32. The network is left in evaluation mode."""
     network.eval()
     device = next(network.parameters()).device
     parts = []
@@ -185,7 +192,8 @@ def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.fl
 
 
 class SamePad(nn.Module):
-    """Zero padding that gives the next `layer` TensorFlow's SAME padding.
+    """Zero padding before `layer`, which has none of its own: both together compute TensorFlow's
+    SAME padding.
 
     `height`, `width`: size in px of the map that is padded.
     """
@@ -212,8 +220,8 @@ class Residual(nn.Sequential):
 def block(
     layer: nn.Module, norm: nn.Module | None, dropout: float = 0.0, *, skip: bool = False
 ) -> nn.Sequential:
-    """The modules in order: `layer`, batch normalisation if `norm` is given, ReLU, dropout if
-    `dropout` > 0. With `skip` they are one `Residual`."""
+    """Make a sequence of `layer`, batch normalisation if `norm` is given, ReLU, and dropout if
+    `dropout` (a probability) is above 0. With `skip` the sequence adds its input to its output."""
     parts: list[tuple[str, nn.Module]] = [("layer", layer)]
     if norm is not None:
         parts.append(("norm", norm))
@@ -227,8 +235,8 @@ def block(
 
 
 def build_features(architecture: Architecture, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """The module before the fully connected layers, which maps images (B, 3, H, W) to features
-    (B, ...), and the number of features of one image."""
+    """Build the part of the network before the fully connected layers, a module that maps images
+    (B, 3, H, W) to features. Returns the module and the number of features of one image."""
     if architecture.backbone:
         return build_backbone(architecture.backbone, batch_norm=batch_norm)
     features = nn.Sequential()
@@ -265,9 +273,10 @@ def _convolution(channels: int, spec: Conv, batch_norm: bool) -> nn.Sequential:
 
 
 def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
-    """A torchvision model without classifier, randomly initialised, and its number of features.
+    """Build the torchvision model called `name` without its classifier, randomly initialised.
+    Returns the module and its number of features.
 
-    Without `batch_norm` its batch normalisation is folded away.
+    Without `batch_norm` its batch normalisation is folded into the convolutions.
     """
     from torchvision.models import get_model
 
@@ -288,8 +297,8 @@ def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
 
 
 def fold(network: Network) -> Network:
-    """An equivalent network without batch normalisation and target standardisation, in evaluation
-    mode.
+    """Return an equivalent network without batch normalisation and target standardisation, in
+    evaluation mode. `network` does not change.
 
     For `mtl` it is the paper's network. The new weights are computed in float64.
     """
@@ -308,7 +317,8 @@ def fold(network: Network) -> Network:
 
 
 def fold_norms(network: nn.Module) -> None:
-    """Fold each batch normalisation into the preceding convolution; sets evaluation mode."""
+    """Fold each batch normalisation of `network` into the preceding convolution, and set evaluation
+    mode (in place)."""
     network.eval()
     for sequence in [m for m in network.modules() if isinstance(m, nn.Sequential)]:
         for (first, conv), (second, norm) in pairwise(list(sequence.named_children())):

@@ -2,10 +2,12 @@
 
 The graph is written beside the weights, so that `serve` loads it without torch.
 
-The heads, the uncertainty head and the textures are computed in float32 even if the other layers
-are in bf16: OpenVINO rounds the results of a MatMul to bf16, in steps of 0.004 near 1, which is
-0.025 m or 0.005 rad for a head with coded values. The MatMul with the texture directions stays in
-bf16: its result, a sum of squares, then has an error of 0.1 %, at most 0.5 %.
+The heads, the uncertainty head and the texture features of the out-of-distribution score are
+computed in float32 even if all other layers are in bf16, because OpenVINO rounds the results of a
+MatMul to bf16. The steps of bf16 are 0.004 near 1, which is 0.025 m or 0.005 rad for a head with
+coded values. One MatMul of the uncertainty head stays in bf16: the product with
+`texture_directions`. The score is the sum of its squares, which then has an error of 0.1 %, at most
+0.5 %.
 """
 
 import errno
@@ -34,17 +36,19 @@ MIN_NARROW_VALUES = 256  # smaller constants stay in float32
 
 
 def build_graph(network: Network, head: UncertaintyHead | None = None, batch: int = 1) -> Any:
-    """OpenVINO model of a folded network: uint8 images (B, 210, 280, 3) -> float32 (B, K).
+    """Convert a folded network, with its uncertainty head if it has one, to an OpenVINO model that
+    maps uint8 images (B, 210, 280, 3) to float32 (B, K).
 
-    `mtlnet.inference.prediction.split_outputs` explains the K columns. `batch`: number of images, 1
-    or -1; -1 allows any number, and is slower for a single image.
+    K is 9 to 22; `mtlnet.inference.prediction.split_outputs` explains the columns. `batch`: number
+    of images, 1 or -1; -1 allows any number, and is slower for a single image.
     """
     return _converted(ServedNetwork(network, head), batch)
 
 
 def build_feature_graph(network: Network) -> Any:
-    """OpenVINO model of `mtlnet.model.served.FitInputs` for one image: its three results are the
-    nine outputs, the inputs of the uncertainty head and the textures."""
+    """Convert a network to an OpenVINO model with three results for one uint8 image
+    (1, 210, 280, 3): the nine outputs, the inputs of the uncertainty head and the texture features
+    (`mtlnet.model.served.FitInputs`)."""
     return _converted(FitInputs(network), 1)
 
 
@@ -56,7 +60,8 @@ def write_graph(
     *,
     narrow: bool = False,
 ) -> None:
-    """Write the graph to `graph` (.xml) and its weights to `weights` (.bin).
+    """Write the OpenVINO graph of a folded network, and of its uncertainty `head` if given, to
+    `graph` (.xml), and its weights to `weights` (.bin).
 
     `narrow`: constants that float16 holds exactly are stored in float16, all others in float32.
     Raises OSError when writing fails, for example on a full disk; both files are then unchanged.
@@ -85,10 +90,10 @@ def write_graph(
 
 
 def narrow_constants(model: Any, kind: Literal["bf16", "f16"]) -> None:
-    """Store large float32 constants of an OpenVINO model in 16 bits, with conversions to float32
-    (in place).
+    """Store the float32 constants of an OpenVINO model that have 256 values or more in 16 bits of
+    type `kind`, with conversions to float32 (in place).
 
-    bf16 rounds them. f16 is used only for constants that it holds exactly.
+    bf16 rounds the values. f16 is used only for constants that it holds exactly.
     """
     import openvino
     from openvino import opset13 as ops

@@ -1,9 +1,10 @@
 """Initialises a network from a finished model, whose batch normalisation was folded away.
 
 A network without batch normalisation gets the model's weights. A network with batch normalisation
-also gets statistics measured on images, and gains and biases that undo this normalisation, so that
-its outputs equal those of the model. The network may have more residual convolutions than the
-model; the additional ones start near the identity (as in Chen et al. 2016, Net2Net).
+also gets statistics measured on images, and gains and biases that cancel the normalisation by these
+statistics, so that the network's outputs equal the model's. The network may have more residual
+convolutions than the model; the additional ones start near the identity
+(as in Chen et al. 2016, Net2Net).
 """
 
 from pathlib import Path
@@ -25,8 +26,8 @@ no gradient."""
 def load_pretrained(
     network: Network, weights: Path, images: NDArray[np.uint8] | None = None, name: str = ""
 ) -> None:
-    """Set the weights of `network` so that it computes the outputs of a finished model. The units
-    of its heads (`target_mean`, `target_std`) do not change.
+    """Set the weights of `network` so that it computes the outputs of a finished model.
+    `target_mean` and `target_std`, the zero and unit of the heads' outputs, do not change.
 
     `weights`: the model's file. `images` uint8 (B, 210, 280, 3): images on which the statistics of
     the batch normalisation are measured; None for a network without batch normalisation. `name`:
@@ -56,8 +57,8 @@ def load_pretrained(
 
 
 def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
-    """A dict from the submodule name of each convolution of `old` to the name of the same
-    convolution in `new`.
+    """Return a dict that maps the submodule name of each convolution of `old` to the name of the
+    convolution of `new` that gets its weights.
 
     `new` may have more residual convolutions. Raises UserError for any other difference.
     """
@@ -83,12 +84,13 @@ def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
 def restore_batch_norm(
     network: Network, biases: dict[str, Tensor], images: NDArray[np.uint8]
 ) -> None:
-    """Set the batch normalisations of a network that has the filters of a folded model.
+    """Set statistics, gains and biases of all batch normalisations, so that a network with the
+    filters of a folded model computes the model's outputs (in place).
 
     `biases`: the biases of the model's convolutions, by submodule name; convolutions without an
-    entry are new. `images` uint8 (B, 210, 280, 3): images on which the statistics are measured. The
-    filters are rescaled to the size of newly initialised filters, which suits the optimizer's
-    steps; batch normalisation undoes the scale.
+    entry are new, and get the gain 0.02 and the bias 0. `images` uint8 (B, 210, 280, 3): images on
+    which the statistics are measured. The filters are rescaled to the size of newly initialised
+    filters, which suits the optimizer's steps; the gains cancel the scale.
     """
     network.eval()
     device = network.target_mean.device

@@ -13,10 +13,11 @@ from mtlnet.model.uncertainty_head import UncertaintyHead
 
 
 class ServedNetwork(nn.Module):
-    """A folded network, its softmax, and its uncertainty head if it has one.
+    """A folded network with the softmax of its classes, and its uncertainty head if it has one.
 
-    It maps uint8 images (B, 210, 280, 3) to float32 (B, K);
-    `mtlnet.inference.prediction.split_outputs` explains the K columns.
+    It maps uint8 images (B, 210, 280, 3) to float32 (B, K): nine outputs, then 8 columns of the
+    uncertainty head and 5 probabilities of absence where the model has them
+    (`mtlnet.inference.prediction.split_outputs`).
     """
 
     def __init__(self, network: Network, head: UncertaintyHead | None = None) -> None:
@@ -34,9 +35,9 @@ class ServedNetwork(nn.Module):
 
 
 class FitInputs(ServedNetwork):
-    """Computes the data on which the uncertainty head is fitted, from uint8 images (B, 210, 280,
-    3): the nine outputs (B, 9), the network's inputs of the head (B, X) and the texture features
-    (B, C + M) of `mtlnet.model.textures`."""
+    """Computes the data on which the uncertainty head is fitted, from uint8 images
+    (B, 210, 280, 3): the nine outputs (B, 9), the inputs of the head that come from the network
+    (B, 256 or 262), and the texture features (B, 1040) of `mtlnet.model.textures`."""
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
         x = self.network.forward_features(images)

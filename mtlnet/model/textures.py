@@ -1,11 +1,13 @@
 """Texture features of an image, from which the out-of-distribution score and the light features are
 computed.
 
-An image is divided into 14 x 8 cells of three bands, one above the other. The features of a cell or
-band are its mean colours in [-1, 1], and the square roots of the mean absolute differences of
-brightness between horizontal and vertical neighbours. The functions are torch operations without
-branches, so that they can be part of an exported network. In shapes B is the number of images,
-C = CELL_VALUES, M = CENTRE_VALUES.
+An image is divided into 14 x 8 cells, and each cell into three bands, one above the other. The five
+features of a cell or band are its three mean colours in [-1, 1], and the square roots of the mean
+absolute differences of brightness between horizontal and vertical neighbours. The functions are
+torch operations without branches, so that they can be part of an exported network.
+
+In shapes B is the number of images, C = 560 the number of values of all cells (`CELL_VALUES`), and
+M = 480 the number of values of the 24 x 4 bands in the image centre (`CENTRE_VALUES`).
 """
 
 import torch
@@ -28,11 +30,11 @@ LEVEL = 1 / 127.5  # difference of two successive uint8 colours on the scale [-1
 
 
 def texture_features(images: Tensor) -> Tensor:
-    """Texture features (B, C + M) of images uint8 (B, H, W, 3): the C values of all cells, then the
-    M values of the bands in the image centre.
+    """Compute the texture features (B, C + M) of images uint8 (B, H, W, 3): the C = 560 values of
+    all cells, then the M = 480 values of the bands in the image centre.
 
-    H must be a multiple of 42 (14 rows of cells with three bands each), W a multiple of 8 (columns
-    of cells).
+    H must be a multiple of 42 (14 rows of cells with three bands each), W a multiple of 8
+    (columns of cells).
     """
     sums, pixels = band_sums(images)
     colours = sums[:, :COLOURS] * (LEVEL / pixels) - 1
@@ -44,8 +46,8 @@ def texture_features(images: Tensor) -> Tensor:
 
 
 def band_sums(images: Tensor) -> tuple[Tensor, int]:
-    """Sums over each band (B, PLANES, bands, columns) of images uint8 (B, H, W, 3), and the number
-    of pixels of a band.
+    """Compute the sums of five planes over each band (B, 5, 42, 8), and the number of pixels of a
+    band, for images uint8 (B, H, W, 3).
 
     The planes are red, green, blue, and the absolute differences of red + green + blue from the
     next column and from the next row, which are 0 in the last column and row. All sums are integers
@@ -71,8 +73,8 @@ def _sums(planes: Tensor) -> Tensor:
 
 
 def light_features(textures: Tensor) -> Tensor:
-    """Light features (B, LIGHT_VALUES) from textures (B, C + M): the mean of each texture plane
-    over the upper half, then over the lower half of the image."""
+    """Compute the light features (B, 10) from texture features (B, C + M): for each of the five
+    planes its mean over the upper half of the image, then its mean over the lower half."""
     cells = textures[:, :CELL_VALUES].reshape(-1, LIGHT_VALUES, CELL_VALUES // LIGHT_VALUES)
     return cells.mean(2)
 

@@ -13,8 +13,9 @@ out of distribution if the value is above 1.
 
 - The squared Mahalanobis distance of the image's texture features from those of the training frames
   (Lee et al. 2018). The last shared features are unsuitable, because a network trained on roads
-  maps other images near their mean. In a measurement with a model of 230 steps at 1 % false alarms,
-  the last features detected 1 % of noise and text images, the texture features all of them.
+  maps other images near their mean. In a measurement with a model trained for 230 steps, at 1 %
+  false alarms, the last shared features detected 1 % of noise and text images, the texture features
+  all of them.
 - The square of the camera's pitch offset, predicted by two layers from the texture features of the
   image centre: a camera that looks up or down sees the same textures slightly higher or lower.
 """
@@ -80,10 +81,12 @@ class UncertaintyHead(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, x: Tensor, textures: Tensor) -> Tensor:
-        """Standard deviations and the OOD score, (B, D + 1).
+        """Compute the standard deviations, in m and for the angle in rad, and the OOD score:
+        (B, D + 1), the score last.
 
         `x` (B, X): result of `Network.uncertainty_inputs`; a head fitted on fewer inputs reads only
-        the first columns. `textures` (B, C + M): result of `mtlnet.model.textures`.
+        the first columns. `textures` (B, C + M): result of
+        `mtlnet.model.textures.texture_features`.
         """
         count = min(int(x.shape[1]), len(self.centre))
         z = x[:, :count]
@@ -98,8 +101,8 @@ class UncertaintyHead(nn.Module):
         return torch.cat([log_std.exp(), torch.maximum(distance, pitch * pitch)], 1)
 
     def pitch_offset(self, centre: Tensor) -> Tensor:
-        """Pitch of the camera relative to the training camera, (B, 1), positive downwards, in
-        multiples of the limit above which an image is out of distribution.
+        """Predict the pitch of the camera relative to the training camera, (B, 1), positive
+        downwards, in multiples of the limit above which an image is out of distribution.
 
         `centre` (B, M): the texture features of the image centre.
         """
@@ -107,7 +110,7 @@ class UncertaintyHead(nn.Module):
         return offset
 
     def to_bytes(self) -> bytes:
-        """The content of the head's file, in the format of safetensors."""
+        """Return the content of the head's file, in the format of safetensors."""
         state = self.state_dict()
         return save({stored: state[name].contiguous() for name, stored in TENSOR_NAMES.items()})
 
@@ -138,17 +141,18 @@ TENSOR_NAMES = {
 
 
 def load_uncertainty_head(path: Path) -> UncertaintyHead:
-    """The head in a file. Raises OSError, SafetensorError, KeyError or RuntimeError when it is
-    damaged."""
+    """Load the uncertainty head in the file `path`. Raises OSError, SafetensorError, KeyError or
+    RuntimeError when the file is damaged."""
     tensors = load(path.read_bytes())
     return UncertaintyHead({name: tensors[stored] for name, stored in TENSOR_NAMES.items()})
 
 
 def standardise(x: Tensor, centre: Tensor, scale: Tensor, count: int) -> Tensor:
-    """Standardised inputs (N, F) of the layers that predict the standard deviations.
+    """Standardise the inputs `x` (N, F) of the layers that predict the standard deviations: the
+    result (N, F) is (x - centre) * scale, with `centre` and `scale` (F,).
 
-    The first `count` columns of `x` (N, F) come from the network; the remaining columns are light
-    features, which are clipped to +-`LIGHT_LIMIT`.
+    The first `count` columns of `x` come from the network; the remaining columns are light
+    features, whose results are clipped to -3 to 3.
     """
     z = (x - centre) * scale
     return torch.cat([z[:, :count], z[:, count:].clamp(-LIGHT_LIMIT, LIGHT_LIMIT)], 1)

@@ -30,10 +30,10 @@ exactly."""
 
 
 def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Images uint8 (B, H, W, 3) with blocks of 4 x 4 px as channels: (B, 48, ceil(H / 4), W / 4) of
-    type `dtype`, channels-last.
+    """Convert images uint8 (B, H, W, 3) to one pixel with 48 channels for each block of 4 x 4 px:
+    (B, 48, ceil(H / 4), W / 4) of type `dtype`, channels-last.
 
-    Values are colours minus `COLOUR_OFFSET`; rows below the image are 0. W must be a multiple of 4.
+    Values are colours minus 127.5; rows below the image are 0. W must be a multiple of 4.
     """
     count, height, width, _ = images.shape
     rows, columns, rest = -(-height // BLOCK), width // BLOCK, height % BLOCK
@@ -58,8 +58,9 @@ def space_to_depth(images: Tensor, dtype: torch.dtype) -> Tensor:
 def space_to_depth_convolution(
     x: Tensor, weight: Tensor, bias: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
-    """The first convolution with stride 4, (B, F, h, w), computed from the result (B, 48, h, w) of
-    `space_to_depth`. `weight` is (F, 3, 11, 11) or (F, 3, 12, 12)."""
+    """Compute a convolution with stride 4 of normalised images from `x` (B, 48, h, w), the result
+    of `space_to_depth`; the result is (B, F, h, w) in `dtype`. `weight` is (F, 3, 11, 11) or
+    (F, 3, 12, 12), for colours in [-1, 1]; `bias` is (F,)."""
     short = 3 * BLOCK - weight.shape[2]
     kernel = pad(weight * (1 / COLOUR_OFFSET), (short, 0, 0, short))
     filters = len(weight)
@@ -106,8 +107,8 @@ class _Im2colConvolution(torch.autograd.Function):
 
 
 def im2col_convolution(x: Tensor, weight: Tensor, stride: int) -> Tensor:
-    """Convolution with SAME padding of x (B, C, H, W) by `weight` (F, C, k, k), both
-    channels-last."""
+    """Compute the convolution with SAME padding of `x` (B, C, H, W) by `weight` (F, C, k, k), both
+    channels-last; the result is (B, F, ceil(H / stride), ceil(W / stride))."""
     out_nhwc = _Im2colConvolution.apply(x.permute(0, 2, 3, 1), weight.permute(0, 2, 3, 1), stride)
     out: Tensor = out_nhwc.permute(0, 3, 1, 2)
     return out

@@ -3,8 +3,9 @@ ReLU.
 
 torch reads bf16 values in channels-last order more often and takes several times as long. Values
 are bf16 (stored as uint16), float32 or float64. Parameters of a channel (C,) and computed values
-are float32, or float64 for float64 values. Sums have that type within blocks of `BLOCK_ROWS` rows
-and are float64 over the blocks. `in_threads` runs a loop on as many threads as torch uses.
+are float32, or float64 if the values are float64. Sums are computed in the parameters' type within
+blocks of 256 rows, and in float64 over the blocks. `in_threads` runs a loop on as many threads as
+torch uses.
 """
 
 from collections.abc import Callable
@@ -111,10 +112,12 @@ def add_gradient_sums(
     sums: Sums,
     products: Sums,
 ) -> None:
-    """Add the sums over the rows of g and of g (x - mean) to `sums` and `products` (C,).
+    """Add the sums over the rows that the gradient of y = relu(a x + b) needs to `sums` and
+    `products` (C,).
 
-    g (N, C) is the gradient of the loss with respect to a x + b. It is computed from `gradient`
-    (N, C), the gradient with respect to relu(a x + b).
+    `gradient` (N, C) is the gradient with respect to y, and g is the gradient with respect to a x +
+    b: `gradient` where y > 0, else 0. The function adds the sum of g over the rows to `sums`, and
+    the sum of g (x - mean) to `products`. `x` is (N, C); `a`, `b` and `mean` are (C,).
     """
     zero = a.dtype.type(0)
     block_sums, block_products = np.zeros_like(a), np.zeros_like(a)
@@ -135,7 +138,8 @@ def add_gradient_sums(
 def input_gradient(
     gradient: Values, x: Values, a: Values, b: Values, slope: Values, offset: Values, out: Values
 ) -> None:
-    """Set `out` (N, C) to a g + slope x + offset, with g as in `add_gradient_sums`."""
+    """Set `out` (N, C) to a g + slope x + offset. Here g is `gradient` (N, C) where a x + b > 0,
+    else 0; `x` is (N, C), all other arguments are (C,)."""
     zero = a.dtype.type(0)
     for n in range(x.shape[0]):
         for c in range(x.shape[1]):
@@ -146,7 +150,7 @@ def input_gradient(
 
 @compiled_for_threads
 def add_affine(x: Values, slope: Values, offset: Values, out: Values) -> None:
-    """Add slope x + offset to `out` (N, C)."""
+    """Add slope x + offset to `out` (N, C), for `x` (N, C), `slope` and `offset` (C,)."""
     for n in range(x.shape[0]):
         for c in range(x.shape[1]):
             sum_ = widen(out[n, c]) + (widen(x[n, c]) * slope[c] + offset[c])
@@ -162,7 +166,7 @@ def centre(pixels: NDArray[np.uint8], offset: float, out: Values) -> None:
 
 
 def as_rows(x: Tensor) -> Values:
-    """The values of `x` (B, C, H, W) as an array (B * H * W, C), with bf16 stored as uint16.
+    """Return the values of `x` (B, C, H, W) as an array (B * H * W, C), with bf16 stored as uint16.
 
     The array shares the memory of `x` if `x` is channels-last.
     """
@@ -177,10 +181,11 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def in_threads(work: Callable[[slice, int], None], rows: int) -> None:
-    """Call `work(part, number)` for each of `part_count()` parts of `rows` rows, each on its own
-    thread.
+    """Divide `rows` rows into as many parts as torch uses threads, and call `work(part, number)`
+    for each part on its own thread. `part` is the slice of the rows, `number` counts the parts from
+    0.
 
-    Raises the exceptions of `work`.
+    Returns when all parts are done. Raises the exceptions of `work`.
     """
     parts = part_count()
     bounds = [rows * number // parts for number in range(parts + 1)]
@@ -196,5 +201,5 @@ def in_threads(work: Callable[[slice, int], None], rows: int) -> None:
 
 
 def part_count() -> int:
-    """Number of threads that torch uses."""
+    """Return the number of threads that torch uses."""
     return torch.get_num_threads()

@@ -28,9 +28,12 @@ FAST = (MTL.features, GRID.features, GRID_RESIDUAL.features)
 def training_outputs(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Outputs (B, 9) float32 for images uint8 (B, 210, 280, 3), computed in `dtype`.
+    """Compute the network's outputs (B, 9) float32, six coded values and three class scores, for
+    images uint8 (B, 210, 280, 3). The heads are computed in float32, all layers before them in
+    `dtype`.
 
-    `masks`: scaled dropout masks (B, units) of the shared layers; empty: no dropout.
+    `masks`: for each shared layer a dropout mask (B, units) with values 0 or 1 / (1 - probability);
+    empty: no dropout.
     """
     return network.forward_heads(forward_features(network, images, dtype, masks))
 
@@ -38,15 +41,17 @@ def training_outputs(
 def forward_features(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Last shared features (B, 256) in `dtype` of images uint8 (B, 210, 280, 3).
+    """Compute the last shared features (B, 256), of type `dtype`, of images uint8 (B, 210, 280, 3).
 
-    `masks`: scaled dropout masks (B, units) of the shared layers; empty: no dropout.
+    `masks`: for each shared layer a dropout mask (B, units) with values 0 or 1 / (1 - probability);
+    empty: no dropout.
     """
     return forward_shared(network, forward_grid(network, images, dtype), dtype, masks)
 
 
 def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor:
-    """Features (B, C, h, w) of the last convolution for images uint8 (B, 210, 280, 3)."""
+    """Compute the features of the last convolution, C channels of h x w px (B, C, h, w), of type
+    `dtype`, for images uint8 (B, 210, 280, 3)."""
     layers = network.architecture.features
     above = images.shape[1] - HEIGHT + network.architecture.first_row
     x = space_to_depth(images[:, above:], dtype)
@@ -62,8 +67,12 @@ def forward_grid(network: Network, images: Tensor, dtype: torch.dtype) -> Tensor
 def forward_shared(
     network: Network, grid: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Last shared features (B, 256), computed from the features (B, C, h, w) of the last
-    convolution."""
+    """Compute the last shared features (B, 256), of type `dtype`, from the features `grid`
+    (B, C, h, w) of the last convolution.
+
+    `masks`: for each shared layer a dropout mask (B, units) with values 0 or 1 / (1 - probability);
+    empty: no dropout.
+    """
     x = grid.flatten(1)
     for number in range(len(network.architecture.shared)):
         layer = network.shared.get_submodule(f"fc{number}.layer")

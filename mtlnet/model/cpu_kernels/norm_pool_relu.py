@@ -1,8 +1,9 @@
 """Fused batch normalisation, max pooling and ReLU for training.
 
 max(relu(a x + b)) = relu(a max(x) + b) for a >= 0. Therefore pooling is computed first, which saves
-three quarters of the work. Where a is negative, the caller negates the filter and a. The statistics
-are computed over the batches of all processes (Ioffe and Szegedy 2015, algorithm 1).
+three quarters of the work. Where a is negative, the caller of `norm_pool_relu` negates the
+preceding convolution's filter, and the function negates a. The statistics are computed over the
+batches of all processes (Ioffe and Szegedy 2015, algorithm 1).
 """
 
 from typing import Any
@@ -29,10 +30,12 @@ native = torch.ops.aten
 
 
 def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
-    """Arguments that give `max_pool2d` TensorFlow's SAME padding for maps of `height` x `width` px.
+    """Return the arguments that give `max_pool2d` TensorFlow's SAME padding for maps of `height` x
+    `width` px.
 
     `padding` pads the top and left edges, `ceil_mode` the bottom and right edges. torch pads with
-    minus infinity; followed by a ReLU, the result equals that with zeros (`mtlnet.model.network`).
+    minus infinity; if a ReLU follows, the result is the same as with zeros
+    (`mtlnet.model.network`).
     """
     before = [same_padding(size, pool.kernel, pool.stride)[1] for size in (height, width)]
     return {
@@ -44,8 +47,9 @@ def pool_arguments(height: int, width: int, pool: Pool) -> dict[str, Any]:
 
 
 def statistics(x: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Mean (C,), biased variance (C,) and number of values of each channel of x (B, C, H, W), over
-    the batches of all processes. Mean and variance are float32 for bf16 values."""
+    """Compute the mean (C,), the biased variance (C,) and the number of values of each channel of
+    `x` (B, C, H, W), over the batches of all processes. Mean and variance are float32 for bf16
+    values."""
     values = as_rows(x.detach())
     count = len(values)
     dtype = torch.promote_types(x.dtype, torch.float32)
@@ -152,9 +156,10 @@ def _unpool(gradient: Tensor, x: Tensor, pool: dict[str, Any], places: Tensor) -
 
 
 def norm_pool_relu(x: Tensor, sign: Tensor, norm: nn.BatchNorm2d, pool: Pool | None) -> Tensor:
-    """Batch normalisation, max pooling and ReLU of x (B, C, H, W).
+    """Compute batch normalisation, max pooling (none if `pool` is None) and ReLU of `x`
+    (B, C, H, W); the result is (B, C, h, w).
 
-    x is the output of the convolution times `sign` (C,), the sign of the normalisation's gain
+    `x` is the output of the convolution times `sign` (C,), the sign of the normalisation's gain
     `norm.weight`. The running statistics of `norm` are updated as torch does.
     """
     with torch.no_grad():
