@@ -36,10 +36,12 @@ class _ModelsOwn(Exception):
 def with_lens(
     source: Source, model: CameraParameters, given: Lens, note: Note, *, calibrate: bool = False
 ) -> Source:
-    """The source with its lens: `given`, else the lens that a recording states, else with
-    `calibrate` a lens estimated from the pictures of the film or stream.
+    """Return `source` with the camera that took its pictures: `given`, else the camera that a
+    recording states, else with `calibrate` a camera estimated from the pictures of the film or
+    stream, else the camera `model` of the model.
 
-    If `given` is a field of view in degrees, `calibrate` estimates only the mount. `note` is called
+    `given` is a rectification from this camera to the model's, the vertical field of view in
+    degrees, or None. For a field of view, `calibrate` estimates only the mount. `note` is called
     with a line about the camera that was found.
     """
     if isinstance(given, Rectification) or source.problem or source.kind is SourceKind.ROUND:
@@ -117,8 +119,8 @@ def _failed(name: str, error: Exception) -> str:
 
 
 class DriveLens:
-    """Finds the camera of a stream while its pictures arrive. Until then the lens is `given`, or
-    None for the model's camera."""
+    """Finds the camera of a stream while its pictures arrive. Before the camera is found, the lens
+    is `given`, a vertical field of view in degrees, or None for the model's camera."""
 
     def __init__(self, name: str, model: CameraParameters, given: float | None, note: Note) -> None:
         self._name, self._model, self._given, self._note = name, model, given, note
@@ -129,7 +131,8 @@ class DriveLens:
         self._done = False
 
     def at(self, picture: Picture) -> Lens:
-        """The lens for `picture`. Must be called for each picture in order."""
+        """Return the lens for `picture`. Must be called for each picture in order, because it also
+        estimates the camera."""
         if not self._done and picture.image is not None and picture.time_s is not None:
             self._take(picture.image, picture.time_s, picture.bgr)
         return self._lens

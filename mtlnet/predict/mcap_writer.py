@@ -43,7 +43,7 @@ ORANGE = Color(**dict(zip("rgb", (c / 255 for c in PREDICTION_COLOUR), strict=Tr
 
 
 class McapWriter:
-    """Writes each image and its prediction as messages with one log time. The end of the context
+    """Writes each image and its prediction as messages with one log time. Leaving the context
     completes the file."""
 
     def __init__(self, path: Path, camera: CameraParameters, fps: float) -> None:
@@ -133,9 +133,9 @@ class McapWriter:
 def annotations(
     item: SourceImage, prediction: Prediction, view: CameraParameters, time: Any
 ) -> bytes:
-    """The serialised `ImageAnnotations` of an image: predicted markings and a round's labels as
-    polylines, and the features as text. Without labels the lines are straight, because the
-    curvature is not predicted."""
+    """Return the serialised `ImageAnnotations` of an image: predicted markings and a round's labels
+    as polylines, and the features as text. Without labels the lines are straight, because the
+    curvature is not predicted. `time`: a protobuf Timestamp."""
     message = ImageAnnotations(timestamp=time)
     truth, curvature = item.truth, item.truth.curvature if item.truth else 0.0
     styles: list[tuple[Distances, float, Any]] = [
@@ -165,7 +165,7 @@ def annotations(
 
 
 def features_schema() -> dict[str, Any]:
-    """JSON schema of `/features`, for Foxglove's panels."""
+    """Return the JSON schema of the messages on `/features`, for Foxglove's panels."""
     number = {"type": "number"}
     names = [f"{marking}_m" for marking in tf.MARKINGS]
     names += ["to_lane_centre_m", "angle_rad", *(f"p_{name}" for name in ROAD_CLASSES)]

@@ -30,7 +30,7 @@ KEPT_ROWS = 10_000
 
 class InputsLeftOut(UserError):
     """Raised when some inputs or images could not be used; `results` has the results of the other
-    images, at most `KEPT_ROWS`."""
+    images, at most the first 10,000."""
 
     def __init__(self, message: str, results: list[dict[str, Any]]) -> None:
         super().__init__(message)
@@ -50,13 +50,14 @@ def predict_files(
 ) -> list[dict[str, Any]]:
     """Predict the features of all images that `inputs` name (`mtlnet.sources.find.find_sources`).
 
-    Returns the results of the first `KEPT_ROWS` images; all results are written to each of
-    `outputs` (`mtlnet.predict.writers.open_writer`), image by image. `lens`: the lens of all
+    Returns the results of the first 10,000 images, a dict for each; all results are written to each
+    of `outputs` (`mtlnet.predict.writers.open_writer`), image by image. `lens`: the lens of all
     sources except recorded rounds, which must be of the model's camera; None: the lens that a
     recording states or that is estimated, else the model's. `report`: called with the numbers of
     images done and in total. `note`: called with a line about files that are left out and cameras
-    that are found. `topic`: the topic to read from recordings. `calibrate`: estimate the camera of
-    films and streams from their pictures. Ctrl-C ends a stream normally.
+    that are found. `topic`: the topic to read from recordings; empty: the only topic with pictures.
+    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends a stream
+    normally.
 
     Raises InputsLeftOut, after all other images are done, when an input or an image could not be
     used; UserError at once for an invalid `lens`, and for outputs that cannot be written or are
@@ -96,8 +97,8 @@ def predict_files(
 
 
 def answer(engine: Engine, item: SourceImage) -> Prediction:
-    """The features that `engine` predicts for an image that could be read, with distances in metres
-    at the image's own camera."""
+    """Run `engine` on an image that could be read, and return its features, with distances in
+    metres at the image's own camera."""
     assert item.image is not None
     outputs = engine(item.image)
     if item.lens is not None:
@@ -106,7 +107,7 @@ def answer(engine: Engine, item: SourceImage) -> Prediction:
 
 
 def first_of(errors: list[str]) -> str:
-    """The first of `errors`, with the number of the remaining errors."""
+    """Return the first of `errors` and the number of the remaining errors, as one text."""
     return f"{errors[0]} (and {len(errors) - 1} more)" if len(errors) > 1 else errors[0]
 
 

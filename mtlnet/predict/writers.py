@@ -36,8 +36,8 @@ most 255."""
 
 
 class Writer(Protocol):
-    """Interface of a writer of images and predictions, one by one. The end of its context closes
-    the file."""
+    """Interface of a writer of images and predictions, one by one. Leaving the context closes the
+    file."""
 
     def write(self, item: SourceImage, prediction: Prediction) -> None: ...
 
@@ -47,9 +47,11 @@ class Writer(Protocol):
 
 
 def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
-    """The writer for the suffix of `path`; a path without a suffix is a folder of pictures.
+    """Open the writer for the suffix of `path`; a path without a suffix is a folder of pictures.
 
-    Raises UserError for another suffix, or a parent folder that does not exist.
+    `camera`: the model's camera, in whose view pictures are drawn. `fps`: frames per second of a
+    film or recording. Raises UserError for an unknown suffix, or a parent folder that does not
+    exist.
     """
     kind = path.suffix.lower()
     if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX, ""):
@@ -73,8 +75,8 @@ def require_other_file(path: Path, inputs: list[Path]) -> None:
 
 
 def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
-    """Features of one image as a flat row, in m and rad; None for a value that is absent, unknown
-    or not predicted."""
+    """Return the features of one image as a flat dict from column to value, in m and rad; a value
+    that is absent, unknown or not predicted is None."""
     std = prediction.std or {}
     row: dict[str, Any] = {"image": item.name, "time_s": item.time_s}
     for marking in tf.MARKINGS:
@@ -166,15 +168,16 @@ class PictureWriter:
 
 
 def view_of(item: SourceImage, model: CameraParameters) -> CameraParameters:
-    """The camera that takes the image in the model's view, from the position of the real camera."""
+    """Return the camera of the image that the network sees: the model's camera `model`, moved to
+    the position on the car of the camera that took the image."""
     return model if item.lens is None else item.lens.view
 
 
 def draw_prediction(
     item: SourceImage, prediction: Prediction, model: CameraParameters
 ) -> NDArray[np.uint8]:
-    """The image in the model's view with its markings drawn (prediction orange, a round's labels
-    green), a view from above beside it, and the features as text below: uint8 RGB.
+    """Draw the image with its markings (prediction orange, a round's labels green), a view from
+    above beside it, and the features as text below it. Returns uint8 RGB (H, W, 3).
 
     Without labels the markings are drawn straight, because the curvature is not predicted.
     """
