@@ -30,7 +30,8 @@ LogCallback = ctypes.CFUNCTYPE(
 
 @dataclass
 class DecodingErrors:
-    """The errors that FFmpeg has reported: their number `count` and the text `first` of the first.
+    """The errors that FFmpeg has reported since the last `forget`. `count` is their number, `first`
+    the text of the first error.
 
     `unconverted`: text of an error in the conversion to RGB, after which OpenCV returns a black
     picture. `size`: coded size (width, height) of later pictures, if a decoder of H.264 or MJPEG
@@ -47,11 +48,12 @@ class DecodingErrors:
         self.count, self.first, self.unconverted, self.size = 0, "", "", None
 
     def new_size(self, shape: tuple[int, ...]) -> tuple[int, int] | None:
-        """The new size (width, height) of the pictures if it differs from `shape` (H, W, 3) of the
-        first picture, else None.
+        """Return the coded size (width, height) of the present pictures in px if it does not fit
+        the first picture, which has the shape `shape` (H, W, 3); else None.
 
-        A coded size is rounded up to a multiple of `BLOCK_PX`; width and height of a rotated film
-        are exchanged.
+        A coded size fits if it is less than 16 px larger, because it is rounded up to a multiple of
+        16 px, and also with width and height exchanged, because OpenCV may have rotated the
+        picture.
         """
         if self.size is None:
             return None
@@ -61,7 +63,9 @@ class DecodingErrors:
         return None if all(fits) else self.size
 
     def add(self, line: str) -> None:
-        """Count a line of the log, for example "[h264 @ 0x55d0] Reference 2 >= 2"."""
+        """Count a line of FFmpeg's log as an error, for example "[h264 @ 0x55d0] Reference 2 >= 2",
+        and keep its text in `first` or `unconverted`. Lines that do not concern pictures
+        (`HARMLESS`) are ignored."""
         found = PREFIX.match(line)
         text = " ".join(line[found.end() if found else 0 :].split())
         if any(part in text for part in HARMLESS):

@@ -29,8 +29,8 @@ MP4_FIRST = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"st
 
 
 def missing_end(path: Path) -> str:
-    """A text about what is missing at the end of the file; empty if nothing is missing, or if the
-    format states no size (MPEG-TS, raw streams)."""
+    """Return a text about what is missing at the end of the film's file; empty if nothing is
+    missing, or if the format states no size (MPEG-TS, raw streams)."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(16)
@@ -53,8 +53,8 @@ def missing_end(path: Path) -> str:
 
 
 def unsupported_picture(path: Path) -> str:
-    """A text about why the pictures must not be used as they are stored (cropped, mirrored,
-    stereoscopic); empty if they can be used."""
+    """Return a text about why the film's pictures must not be used as they are stored
+    (cropped, mirrored, stereoscopic); empty if they can be used."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(16)
@@ -66,7 +66,8 @@ def unsupported_picture(path: Path) -> str:
 
 
 def stated_frames(path: Path, counted: int) -> int:
-    """The exact number of frames that a film must have; 0 if its container does not state it.
+    """Return the exact number of frames that a film must have; 0 if its container does not state
+    it.
 
     For an AVI it is the number of frames in the index, without empty frames. For a Y4M it is
     `counted`, OpenCV's number, which is computed from the file's size. Other containers state only

@@ -38,8 +38,8 @@ class FilmHeader:
 
 
 def read_film_header(path: Path) -> FilmHeader:
-    """The header of a film. Raises UserError for a file that is not a film, OSError for an
-    unreadable file."""
+    """Read the header of the film at `path`. Raises UserError for a file that is not a film,
+    OSError for an unreadable file."""
     with decoding_errors() as errors:
         film = _open(path, errors)
         count, fps = film.get(cv2.CAP_PROP_FRAME_COUNT), film.get(cv2.CAP_PROP_FPS)
@@ -191,7 +191,7 @@ def _unconverted(errors: DecodingErrors) -> str:
 
 
 def no_frame(film: cv2.VideoCapture, errors: DecodingErrors) -> str:
-    """A text about why no frame of a film that could be opened can be read."""
+    """Return a text about why no frame can be read of a film that could be opened."""
     packed = int(film.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
     code = packed.to_bytes(4, "little").decode("latin-1").strip("\0 ")
     codec = CODECS.get(code, code if code.isprintable() else "") or "its codec"

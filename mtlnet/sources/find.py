@@ -43,20 +43,20 @@ class Source:
 
     @property
     def name(self) -> str:
-        """Name in tables and messages."""
+        """Name of the source in tables and messages."""
         return self.address or str(self.path)
 
     @property
     def files(self) -> list[Path]:
-        """The files that are read, and so must not be written to."""
+        """The files from which the images are read, and which must not be written to."""
         return list(self.path.iterdir()) if self.path.is_dir() else [self.path]
 
 
 def find_sources(
     inputs: list[str], note: Note = lambda line: None, topic: str = ""
 ) -> list[Source]:
-    """The sources that `inputs` name: a file, the files of a folder or pattern, a webcam by its
-    number, a stream by its address.
+    """Find the sources that `inputs` name: a file, the files of a folder or pattern, a webcam by
+    its number, a stream by its address.
 
     The files of an input are in natural order (`frame2` before `frame10`). An input that names
     nothing becomes a source with a problem. `note` is called with a line about other files and
@@ -171,5 +171,5 @@ def _source(path: Path, kind: SourceKind, topic: str) -> Source:
 
 
 def unreadable(path: Path, error: OSError) -> str:
-    """Problem text for a source that cannot be read."""
+    """Return the text about the problem of a source that cannot be read because of `error`."""
     return f"{path} cannot be read ({error.strerror or error})"

@@ -55,7 +55,7 @@ TS_PACKETS = ((0, 188), (4, 192))  # first sync byte and packet size: MPEG-TS, B
 
 
 def kind_of(path: Path) -> SourceKind | None:
-    """Kind of the file at `path`; None for a kind that is not read."""
+    """Return the kind of the file at `path`; None if files of this kind are not read."""
     suffix = path.suffix.lower()
     try:
         with path.open("rb") as file:
@@ -93,7 +93,8 @@ def _kind_of_content(head: bytes) -> SourceKind | None:
 
 
 def bag_metadata(folder: Path) -> dict[str, Any] | None:
-    """Content of the `metadata.yaml` of a ROS 2 bag; None if the folder is not a bag."""
+    """Read the `metadata.yaml` of a ROS 2 bag: the dict under its key
+    `rosbag2_bagfile_information`; None if the folder is not a bag."""
     with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
         found = yaml.safe_load((folder / BAG_METADATA).read_text(encoding="utf-8"))
         if isinstance(found, dict) and isinstance(found.get(BAG), dict):

@@ -21,7 +21,8 @@ in degrees, or None for the model's camera."""
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One picture, or the reason why it cannot be used; later pictures are not affected."""
+    """One picture, or the reason why it cannot be used (`error`). An error does not affect later
+    pictures."""
 
     number: int
     """Number in its source, from 0."""
@@ -38,8 +39,8 @@ class LensFinder(Protocol):
     """Interface of an object that finds the camera of a stream while its pictures arrive."""
 
     def at(self, picture: Picture) -> Lens:
-        """The lens for `picture`; None until the camera is found. Must be called for each picture
-        in order."""
+        """Return the lens for `picture`: that of the camera that was found, before that an assumed
+        lens. Must be called for each picture in order."""
 
 
 class Pictures(Protocol):
@@ -53,10 +54,11 @@ class Pictures(Protocol):
 
 
 def fit(picture: Picture, camera: CameraParameters, lens: Lens) -> Image:
-    """The picture in the view of the model's `camera`: uint8 RGB (camera.height, camera.width, 3).
+    """Convert a picture to the view of the model's `camera`: uint8 RGB
+    (camera.height, camera.width, 3).
 
-    Colours are converted from BGR last, when the picture is small. Raises ImageError when the
-    picture does not show enough of this view.
+    `lens`: the camera that took the picture. Colours are converted from BGR last, when the picture
+    is small. Raises ImageError when the picture does not show enough of this view.
     """
     assert picture.image is not None
     if isinstance(lens, Rectification):
@@ -69,8 +71,8 @@ def fit(picture: Picture, camera: CameraParameters, lens: Lens) -> Image:
 
 
 def other_size(name: str, number: int, size: tuple[int, int], first: tuple[int, int]) -> str:
-    """Fault text for a source whose picture `number` has another size (width, height) than the
-    `first`: another camera, crop or mode took it."""
+    """Return the fault of a source whose picture `number` has another size (width, height), px,
+    than its `first` picture, because another camera, crop or mode took it."""
     return (
         f"{name}: picture {number} is {size[0]} x {size[1]} px, those before it are {first[0]} x "
         f"{first[1]} px and were used; give the rest by itself, with a camera of its own"

@@ -57,14 +57,16 @@ class SourceImage:
 
     @property
     def name(self) -> str:
-        """The source, with the frame's number if it has several images: `film.mp4#12`."""
+        """Name of the source, with the frame's number if the source has several images, for example
+        `film.mp4#12`."""
         return self.source if self.frame is None else f"{self.source}#{self.frame}"
 
 
 def read_sources(
     sources: list[Source], camera: CameraParameters
 ) -> Generator[SourceImage, None, None]:
-    """The images of all sources in order, at the size of `camera`, decoded on another thread.
+    """Yield the images of all sources in order, at the size of the model's `camera`, decoded on
+    another thread.
 
     Close the generator to end a stream.
     """

@@ -31,7 +31,7 @@ DEVICES = Path("/dev")
 
 
 def is_live(given: str) -> bool:
-    """Whether an input names a webcam or the address of a stream, and no existing file or
+    """Return whether an input names a webcam or the address of a stream, and no existing file or
     folder."""
     if Path(given).is_file() or Path(given).is_dir():
         return False
@@ -39,7 +39,8 @@ def is_live(given: str) -> bool:
 
 
 def shown_name(given: str) -> str:
-    """The name of an input in tables, films and messages: an address has no user and password."""
+    """Return the name of an input for tables, films and messages: "webcam 0" for the number 0, and
+    an address without its user and password."""
     if given.isdecimal():
         return f"webcam {given}"
     parts = urlsplit(given) if ADDRESS.match(given) else None
@@ -50,8 +51,8 @@ def shown_name(given: str) -> str:
 
 @dataclass
 class Stream:
-    """An opened webcam or stream. After the last picture, `fault` describes its fault; if it has
-    none, `note` is a text about its end."""
+    """An opened webcam or stream. After the last picture, `fault` describes why it ended too early,
+    or which pictures may be wrong. If `fault` is empty, `note` describes the normal end."""
 
     name: str
     film: cv2.VideoCapture
@@ -65,7 +66,7 @@ class Stream:
     first_error: str = ""
 
     def pictures(self) -> Iterator[Picture]:
-        """Yields the pictures as they arrive, each with its time of arrival."""
+        """Yields the pictures as they arrive, each with its time of arrival, s since 1970."""
         self.errors.forget()
         with self.opened, silent_opencv():
             number, waited_s = 0, 0.0
@@ -117,8 +118,8 @@ class Stream:
 
 
 def open_stream(given: str) -> Stream:
-    """Open the webcam or stream named `given`. Raises UserError when it cannot be opened, for a
-    stream within `OPEN_S`."""
+    """Open the webcam or stream named `given`. Raises UserError when it cannot be opened; a stream
+    must open within 10 s."""
     name = shown_name(given)
     scheme = ADDRESS.match(given)
     if scheme and scheme[1].lower() not in SCHEMES:

@@ -25,10 +25,10 @@ MAX_NUMBER = 1e6  # limit of a matrix (px) or a distortion; damaged files exceed
 
 
 def calibration_topic(image_topic: str, topics: list[Topic]) -> Topic | None:
-    """The calibration topic in the namespace of an image topic, or in the nearest enclosing
-    namespace.
+    """Return the calibration topic for an image topic: the topic directly below the image topic's
+    name, or in the nearest enclosing namespace.
 
-    None if there is no calibration topic, or if the nearest namespace has several.
+    Returns None if there is no calibration topic, or if the nearest namespace has several.
     """
     image = PurePosixPath(image_topic)
     places = [image, *image.parents]
@@ -42,9 +42,12 @@ def calibration_topic(image_topic: str, topics: list[Topic]) -> Topic | None:
 
 
 def camera_of(message: Any, image_topic: str, mount: CameraParameters) -> CameraParameters:
-    """The camera in a calibration message, with position and angles of the camera `mount`.
+    """Return the camera that a calibration message describes, with position and angles of the
+    camera `mount`.
 
-    Raises UserError if the message has no calibration, or an unsupported lens model.
+    `message`: a ROS `CameraInfo` or Foxglove `CameraCalibration`. `image_topic`: name of the topic
+    of the pictures; if it contains `image_rect`, the projection matrix describes them. Raises
+    UserError if the message has no calibration, or an unsupported lens model.
     """
     is_ros = hasattr(message, "header")
     names = "dkp" if is_ros else "DKP"
@@ -71,8 +74,8 @@ def camera_of(message: Any, image_topic: str, mount: CameraParameters) -> Camera
 
 
 def is_models(camera: CameraParameters, model: CameraParameters) -> bool:
-    """Whether a camera has the model's matrix and size and no distortion, so that its pictures fit
-    unchanged."""
+    """Return whether a camera has the model's matrix and size and no distortion, so that its
+    pictures can be used unchanged."""
     same_size = (camera.width, camera.height) == (model.width, model.height)
     matrices = camera.intrinsics(), model.intrinsics()
     return camera.distortion == "none" and same_size and np.allclose(*matrices, atol=SAME_PX)

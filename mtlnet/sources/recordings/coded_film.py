@@ -1,9 +1,9 @@
 """Decodes Foxglove's `CompressedVideo`, one picture per message, with OpenCV's FFmpeg.
 
-The messages are written to a temporary IVF file, in which the time of each message is its number.
-So an undecodable picture does not change the numbers of later pictures. FFmpeg does not read H.265
-in IVF: H.265 messages are written as a raw stream, whose decoded pictures are counted. Source: the
-IVF header of libvpx.
+The messages are written to a temporary IVF file, in which each message has its number as its time,
+so that an undecodable picture does not change the numbers of later pictures. FFmpeg does not read
+H.265 in IVF. H.265 messages are therefore written as a raw stream, whose decoded pictures are
+counted. Source: the IVF header of libvpx.
 """
 
 import struct

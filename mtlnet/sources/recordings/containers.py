@@ -36,16 +36,16 @@ class Container(Protocol):
     fault: str
 
     def topics(self) -> list[Topic]:
-        """Topics with messages, ordered by name. Raises UserError or OSError for an unreadable
-        recording."""
+        """Return the topics with messages, ordered by name. Raises UserError or OSError for an
+        unreadable recording."""
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """Yields log time (ns since 1970) and content of each message of a topic, in order."""
 
 
 def open_container(path: Path) -> Container:
-    """The recording at `path`, a file or the folder of a bag. Raises UserError or OSError when it
-    cannot be read."""
+    """Open the recording at `path`, a file or the folder of a bag. Raises UserError or OSError when
+    it cannot be read."""
     if path.is_dir():
         about = bag_metadata(path) or {}
         if about.get("storage_identifier") != "mcap" or about.get("compression_mode"):
@@ -233,5 +233,5 @@ def _bag_errors() -> tuple[type[Exception], ...]:
 
 
 def names_of(topics: Collection[Topic]) -> str:
-    """The topics as a list with commas, for a message; "none" if there are none."""
+    """Return the topics as a list with commas, for a message; "none" if there are none."""
     return ", ".join(map(str, topics)) or "none"

@@ -25,7 +25,8 @@ class CutDatabase:
         self.fault = ""
 
     def topics(self) -> list[Topic]:
-        """Topics of the file; none if their table is missing."""
+        """Return the topics of the file, also topics without messages; an empty list if their table
+        is missing."""
         with suppress(sqlite3.Error), closing(self._open()) as file:
             rows = file.execute("SELECT name, type FROM topics ORDER BY name").fetchall()
             return [Topic(str(name), str(kind), "cdr") for name, kind in rows]

@@ -35,10 +35,11 @@ IMAGES = (ROS_COMPRESSED, ROS_IMAGE, COMPRESSED, RAW, VIDEO)
 
 
 def reader_of(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
-    """A function that parses the bytes of a message; None if its type is not supported.
+    """Return a function that parses the bytes of a message of type `schema`; None if this type in
+    this encoding is not supported.
 
-    It returns protobuf messages for Foxglove's types in any encoding, and messages of `rosbags` for
-    ROS types. It raises ImageError for damaged bytes.
+    The function returns protobuf messages for Foxglove's types in any encoding, and messages of
+    `rosbags` for ROS types. It raises ImageError for damaged bytes.
     """
     if encoding not in ENCODINGS.get(schema, ()):
         return None
@@ -48,7 +49,8 @@ def reader_of(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
 
 
 def time_of(message: Any) -> float:
-    """Time in a message's header, s since 1970; 0 if it is not set."""
+    """Return the time in the header of a ROS or Foxglove message, s since 1970; 0 if it is not
+    set."""
     if hasattr(message, "header"):
         stamp = message.header.stamp
         return float(stamp.sec) + float(stamp.nanosec) / NANOSECONDS
@@ -56,7 +58,8 @@ def time_of(message: Any) -> float:
 
 
 def picture_of(message: Any, schema: str) -> Image:
-    """The picture in a message of one of `IMAGES` except `VIDEO`: uint8 RGB (H, W, 3).
+    """Decode the picture in a message of type `schema`, a type of image from ROS or Foxglove but
+    not `CompressedVideo`. Returns uint8 RGB (H, W, 3).
 
     Raises ImageError for a damaged or unsupported picture.
     """

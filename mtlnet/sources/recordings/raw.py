@@ -17,8 +17,8 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Layout of an encoding: samples per pixel, bytes per sample, and OpenCV's code for the
-    conversion to RGB (None: no conversion)."""
+    """Layout of the pixels in an encoding of raw pictures: samples per pixel, bytes per sample, and
+    OpenCV's code for the conversion to RGB (None: no conversion)."""
 
     samples: int
     bytes: int
@@ -52,9 +52,10 @@ for _order in ("RGGB", "BGGR", "GBRG", "GRBG"):
 def decode_raw(
     data: NDArray[np.uint8], encoding: str, width: int, height: int, step: int, *, big_endian: bool
 ) -> Image:
-    """The picture in `data` as uint8 RGB (height, width, 3).
+    """Convert the raw picture in `data` to uint8 RGB (height, width, 3).
 
-    `step`: bytes per row, with padding; 0: rows without padding. Raises ImageError for an
+    `encoding`: name of the pixel layout, such as "bgr8". `step`: bytes per row, with padding; 0:
+    rows without padding. `big_endian`: byte order of samples of 16 bits. Raises ImageError for an
     unsupported encoding, or too little data.
     """
     layout = LAYOUTS.get(encoding)

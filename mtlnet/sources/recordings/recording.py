@@ -38,14 +38,16 @@ class Recording:
 
     @property
     def count(self) -> int:
-        """Number of pictures; 0: unknown."""
+        """Number of pictures; 0 if it is unknown."""
         return self.topic.count or 0
 
     def pictures(self) -> Iterator[Picture]:
         """Yields each message's picture, numbered from 0, with the time in its header, or its log
         time if the header has none.
 
-        A message that cannot be decoded becomes a picture with an error.
+        A message that cannot be decoded becomes a picture with an error; in a `CompressedVideo` it
+        is left out, and counted in `fault`. A picture of another size than the first ends the
+        iteration, with a fault.
         """
         if self.topic.schema == VIDEO:
             film = CodedFilm(f"{self.path} {self.topic.name}")
@@ -65,11 +67,11 @@ class Recording:
         self.fault = self.container.fault
 
     def camera(self, mount: CameraParameters) -> tuple[CameraParameters | None, str]:
-        """The camera that the recording states, with position and angles of the camera `mount`, and
-        a line of text about it.
+        """Return the camera that the recording states, with position and angles of the camera
+        `mount`, and a line of text about the camera.
 
-        Returns None and a line with the reason if this camera cannot be used; None and an empty
-        line if the recording states no camera.
+        If this camera cannot be used, returns None and a line with the reason. If the recording
+        states no camera, returns None and an empty line.
         """
         topic = calibration_topic(self.topic.name, self.topics)
         if topic is None:
@@ -113,10 +115,11 @@ class Recording:
 
 
 def open_recording(path: Path, topic: str = "") -> Recording:
-    """The pictures of `topic` in the recording at `path`; empty: of the only topic with pictures.
+    """Open the recording at `path`, to read the pictures of `topic`; empty: of the only topic with
+    pictures.
 
     Raises UserError if `topic` does not exist or has no pictures, or if it is empty and not exactly
-    one topic has pictures; OSError for an unreadable file.
+    one topic has pictures; UserError or OSError for an unreadable recording.
     """
     container = open_container(path)
     topics = container.topics()

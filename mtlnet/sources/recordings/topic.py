@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a recording; `count`: number of messages, None if unknown."""
+    """A topic of a recording. `count` is its number of messages, None if it is unknown."""
 
     name: str
     schema: str
