@@ -32,10 +32,12 @@ EXPORT_CHECK_FRAMES = 16
 
 
 def start_training(options: Mapping[str, Any], out: Path | None, *, resume: bool) -> dict[str, Any]:
-    """Start or resume a training; returns the result of `mtlnet train --json`, or {} in all but the
-    first process of a distributed training.
+    """Start or resume a training, and return its result in the form of `mtlnet train --json`: a
+    dict with `run`, `iterations`, `seconds`, `model_hash` and `export_check`. In all but the first
+    process of a distributed training the dict is empty.
 
-    `options`: the fields of TrainConfig that were given, and `heads`. Raises UserError.
+    `options`: the fields of TrainConfig that were given, and `heads`. `out`: folder of the run;
+    None for a new folder in `runs/`, or with `resume` for the newest run. Raises UserError.
     """
     resumed = None
     if resume:
@@ -121,7 +123,8 @@ def train(
     its card.
 
     `resumed`: the stored description of the data of the run to resume; None starts a new run.
-    `checked`: all images are known to be decodable.
+    `report`: called with the progress every ten steps. `checked`: all images are known to be
+    decodable.
     """
     run_training(config, resumed, finish, report, checked=checked)
     return read_card(config.out)
@@ -147,7 +150,8 @@ def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> None:
 
 
 def link_latest(run: Path) -> None:
-    """Make `runs/latest` a link to `run` if it is in `runs/`."""
+    """Make `runs/latest` a link to the folder `run`; does nothing if this folder is not in
+    `runs/`."""
     if run.resolve().parent != RUNS.resolve():
         return
     link = RUNS / "latest.partial"

@@ -1,1 +1,2 @@
-"""Training: recipes, loss, optimizers, the training loop, and a run from options to model."""
+"""Training: recipes, loss, optimizers, the training loop, and the run that trains a network by a
+configuration."""

@@ -1,9 +1,10 @@
 """Saves and restores the state of a training run. A checkpoint is one safetensors file, written
 atomically.
 
-Its tensors are `network.NAME`, `optimiser.OPTIMIZER.PARAMETER.NAME` (two indices and a name),
-`balance.NAME` (state of the task weighting) and `rng` (state of torch's CPU generator in the first
-process, for dropout). Its metadata are `step` and `elapsed_s`, the seconds trained so far.
+Its tensors are `network.NAME`, `optimiser.I.J.NAME` (state of parameter number J of optimizer
+number I), `balance.NAME` (state of the task weighting) and `rng` (state of torch's CPU generator in
+the first process, for dropout). Its metadata are `step` and `elapsed_s`, the seconds trained so
+far.
 """
 
 from pathlib import Path
@@ -25,7 +26,8 @@ MAX_CHECKPOINTS = 2
 def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
     """Write a checkpoint of `trainer` into the folder `run`, and return its path.
 
-    Deletes all but the newest `MAX_CHECKPOINTS`. `elapsed_s`: seconds trained so far.
+    Keeps the two newest checkpoints of the run and deletes all others. `elapsed_s`: seconds trained
+    so far.
     """
     folder = run / FOLDER
     folder.mkdir(exist_ok=True)
@@ -58,7 +60,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> float:
 
 
 def list_checkpoints(run: Path) -> list[Path]:
-    """Checkpoints of a run, oldest first."""
+    """Return the paths of a run's checkpoints, oldest first."""
     return sorted((run / FOLDER).glob("step-*.safetensors"))
 
 

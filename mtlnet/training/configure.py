@@ -33,7 +33,7 @@ refused."""
 
 
 def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
-    """The configuration of a new run from the `options` given on the command line.
+    """Make the configuration of a new run from the `options` given on the command line.
 
     Defaults come from the recipe, the network or the `init` model. `out`: folder of the run; None
     for `runs/DATE-RECIPE`. Raises UserError for options that contradict each other.
@@ -68,7 +68,8 @@ def _for_gpu(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
-    """Folder and card of the model `name` (a run or a shipped model) from which a run starts.
+    """Find the model `name` (a run or a shipped model) from which a run starts, check its weights,
+    and return its folder and card.
 
     Raises ModelError when the model is missing or damaged.
     """
@@ -94,7 +95,8 @@ def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -
 
 
 def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """The configuration in the folder `run` and the description of its data.
+    """Read `config.json` in the folder `run`; returns the configuration and the description of the
+    data.
 
     Raises ModelError when `config.json` is missing or damaged.
     """
@@ -114,10 +116,11 @@ def read_config(run: Path) -> tuple[TrainConfig, dict[str, Any]]:
 
 
 def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
-    """The stored configuration of a run, changed by the fields `given` on the command line, and
-    the description of its data.
+    """Read the stored configuration of a run and change it by the fields `given` on the command
+    line; returns the configuration and the description of the data.
 
-    Raises UserError when `given` changes a field that is not in `RESUMABLE_WITH`.
+    `iterations`, `minutes`, `device`, `threads`, `data` and `change_data` may change. Raises
+    UserError when `given` changes another field.
     """
     stored, data = read_config(run)
     given = dict(given)
@@ -134,7 +137,8 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
 
 
 def newest_run() -> Path:
-    """The most recently started run in `runs/`. Raises ModelError when there is none."""
+    """Return the folder in `runs/` whose `config.json` was written last, when a run was started, or
+    resumed with other options. Raises ModelError when there is none."""
     runs = [p.parent for p in RUNS.glob(f"*/{CONFIG}") if not p.parent.is_symlink()]
     if not runs:
         raise ModelError(f"there is no run in {RUNS}/ to resume; give its folder with --out")

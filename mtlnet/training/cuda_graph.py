@@ -61,7 +61,8 @@ class CudaRecorder:
 
 
 class CudaGraphStep:
-    """Runs `work` on batches of one shape: `WARM_UP` times directly, then as a recorded graph."""
+    """Runs `work`, a training step, on batches of one shape: three times directly at the start and
+    after each change of its constants, then as a recorded graph."""
 
     def __init__(self, work: Callable[[DeviceBatch], Losses], recorder: Recorder) -> None:
         self._work = work

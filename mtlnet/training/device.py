@@ -15,7 +15,7 @@ from trackfeatures.errors import UserError
 
 
 def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
-    """The torch device called `name`; "auto" selects a GPU if there is one, else the CPU.
+    """Return the torch device called `name`; "auto" selects a GPU if there is one, else the CPU.
 
     With several processes on a machine, "cuda" selects the GPU numbered by the process's local
     index. Raises UserError when the name is unknown or the device is missing.

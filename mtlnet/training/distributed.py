@@ -23,8 +23,9 @@ TIMEOUT = timedelta(minutes=30)  # all other processes wait while the first publ
 
 @dataclass(frozen=True)
 class Rank:
-    """Index of this process and number of processes: among all machines, and on this machine
-    (`local_`)."""
+    """Numbers of this process in a distributed training: `index` of `world_size` processes on all
+    machines, and `local_index` of `local_world_size` processes on this machine. Indices start at
+    0."""
 
     index: int = 0
     world_size: int = 1
@@ -41,9 +42,9 @@ SINGLE_PROCESS = Rank()
 
 
 def read_rank() -> Rank:
-    """The rank of this process, read from the environment variables that torchrun sets.
+    """Read the rank of this process from the environment variables that torchrun sets.
 
-    Without these variables it is `SINGLE_PROCESS`.
+    Without these variables the result is `SINGLE_PROCESS`.
     """
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     values = [os.environ.get(name) for name in names]
@@ -74,7 +75,8 @@ def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None
 
 
 def dropout_seed(seed: int, rank: int, step: int = 0) -> int:
-    """Seed of torch's generators in process `rank`, for a run that starts or resumes at `step`.
+    """Compute the seed of torch's generators in process `rank`, for a run that starts or resumes at
+    `step`.
 
     The seed differs between processes, because equal seeds would give the same dropout masks to
     different images. The first process of a new run uses `seed` itself.
@@ -98,7 +100,8 @@ def average(tensors: Sequence[Tensor]) -> None:
 
 
 def broadcast(values: Sequence[float], device: torch.device) -> list[float]:
-    """The `values` of the first process, so that all processes make the same decisions."""
+    """Send the `values` of the first process to all processes and return them, so that all
+    processes make the same decisions."""
     if not dist.is_initialized():
         return list(values)
     tensor = torch.tensor(values, dtype=torch.float64, device=device)

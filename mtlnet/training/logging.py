@@ -12,8 +12,8 @@ from runtime.tensorboard import TensorBoardWriter
 class CurveLog:
     """Appends points to the loss curves in the folder `run`.
 
-    Stored points after `step` are deleted first. They exist if the run was killed after its last
-    checkpoint.
+    `step`: number of steps taken before the start. Stored points of later steps are deleted first.
+    They exist if the run was killed after its last checkpoint.
     """
 
     columns = COLUMNS
@@ -26,7 +26,7 @@ class CurveLog:
         self._file = path.open("a", newline="", encoding="utf-8")
 
     def write(self, point: Mapping[str, float]) -> None:
-        """Add a point with a value for each of `COLUMNS`."""
+        """Add a point, a dict with a value for each column of `curves.csv` (`COLUMNS`)."""
         self._file.write(_line(_row(point)))
         self._file.flush()
         values = {f"train/{name}": value for name, value in point.items() if name != "step"}

@@ -35,8 +35,8 @@ DIVERGED = (
 
 @dataclass(frozen=True)
 class TrainProgress:
-    """Progress of a run: `fraction` in [0, 1] is done. `losses` (4,): distance, angle, class and
-    total, means over the last `LOG_EVERY` steps."""
+    """Progress of a run after `step` steps. `fraction`: share of the run that is done, in [0, 1].
+    `losses` (4,): distance, angle, class and total loss, means over the last ten steps."""
 
     step: int
     fraction: float
@@ -61,8 +61,8 @@ def train_loop(
 ) -> None:
     """Train until the iterations or the minutes are used up, and save checkpoints.
 
-    `elapsed_s`: seconds trained before this call. `report` is called every `LOG_EVERY` steps.
-    Raises Stopped after Ctrl-C, UserError when the training diverges.
+    `elapsed_s`: seconds trained before this call. `report` is called every ten steps. Raises
+    Stopped after Ctrl-C, UserError when the training diverges.
     """
     log = CurveLog(config.out, trainer.step_number) if trainer.rank.is_first else None
     begin = time.perf_counter() - elapsed_s
@@ -101,8 +101,8 @@ def train_loop(
 
 
 def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
-    """Save a checkpoint and return its path; processes other than the first do not save, and return
-    the run's folder. Raises UserError when a weight is not finite."""
+    """Save a checkpoint in the first process and return its path; all other processes save nothing
+    and return the run's folder. Raises UserError when a weight is not finite."""
     if not trainer.rank.is_first:
         return config.out
     if not all(bool(p.isfinite().all()) for p in trainer.network.parameters()):
@@ -113,7 +113,8 @@ def save(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> Path:
 
 
 def fraction_done(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> float:
-    """Fraction of the run that is done, the larger of the fractions of its steps and its time."""
+    """Compute the fraction of the run that is done, the larger of the fractions of its steps and of
+    its time. `elapsed_s`: seconds trained so far."""
     recipe_steps = None if config.minutes is not None else trainer.recipe.iterations
     steps = config.iterations or recipe_steps
     by_steps = trainer.step_number / steps if steps else 0.0
@@ -122,7 +123,7 @@ def fraction_done(config: TrainConfig, trainer: Trainer, elapsed_s: float) -> fl
 
 
 def curve_point(progress: TrainProgress, trainer: Trainer) -> dict[str, float]:
-    """One row of `curves.csv`, as a dict from the name of a column to its value."""
+    """Make one row of `curves.csv`, a dict from the name of a column to its value."""
     values = (
         progress.step,
         progress.elapsed_s,

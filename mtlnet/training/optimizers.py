@@ -85,7 +85,8 @@ class OptimizerSet:
                 group["lr"] = torch.tensor(group["lr"], dtype=torch.float32, device=device)
 
     def gradients(self) -> list[Tensor]:
-        """The gradients of all parameters that have one; processes average them."""
+        """Return the gradients of all parameters that have one, to be averaged over the
+        processes."""
         return [p.grad for p in self.parameters if p.grad is not None]
 
     def zero_grad(self) -> None:
@@ -94,7 +95,7 @@ class OptimizerSet:
             parameter.grad = None
 
     def set_learning_rate(self, rate: float) -> None:
-        """Set the learning rate to `rate`; Muon's is `MUON_LR_SCALE` times as large."""
+        """Set the learning rate to `rate`; Muon's is 8 times as large."""
         self.learning_rate = rate
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
@@ -113,7 +114,7 @@ class OptimizerSet:
 
 
 def uses_muon(name: str, weight: Tensor) -> bool:
-    """Whether Muon, not AdamW, trains the parameter `weight` called `name`."""
+    """Return whether Muon, not AdamW, trains the parameter `weight` called `name`."""
     sides = as_matrix(weight).shape
     if name.startswith("shared.") and max(sides) <= MUON_MAX_SHARED_SIDE:
         return True
@@ -121,7 +122,8 @@ def uses_muon(name: str, weight: Tensor) -> bool:
 
 
 def as_matrix(weight: Tensor) -> Tensor:
-    """A layer's weights (F, C, H, W) or (F, C) as a matrix (F, -1) that shares their memory.
+    """Return a layer's weights (F, C, H, W) or (F, C) as a matrix (F, H * W * C) or (F, C), which
+    shares their memory if they are channels-last.
 
     The columns are in the order of channels-last memory; Muon does not depend on their order.
     """
@@ -149,7 +151,8 @@ RMS_OF_ADAMW = 0.2
 
 
 class GramMuon(Muon):
-    """Muon for matrices (F, C), with the state of torch.optim.Muon.
+    """Muon for matrices (F, C), which iterates on the Gram matrix of their shorter side. Its state
+    has the form of the state of torch.optim.Muon.
 
     `together`: process the Gram matrices of one size as one batch. This is for a GPU, because the
     product of a single small matrix would leave most of its processors idle.
@@ -204,15 +207,21 @@ def orthogonalize_each(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> Iterator[Tensor]:
     """Yields each matrix (F, C) with its singular values brought near 1, one matrix at a time to
-    save memory. The arguments are explained in `orthogonalize`."""
+    save memory. `coefficients`, `steps` and `min_norm`: the iteration's polynomial, number of
+    iterations and least divisor, as in `orthogonalize`."""
     return (orthogonalize(matrix, coefficients, steps, min_norm) for matrix in matrices)
 
 
 def orthogonalize_together(
     matrices: Iterable[Tensor], coefficients: Coefficients, steps: int, min_norm: float
 ) -> list[Tensor]:
-    """All matrices (F, C) with their singular values brought near 1; Gram matrices (F, F) of one
-    size are processed as one batch (N, F, F). The arguments are explained in `orthogonalize`."""
+    """Return all matrices (F, C) with their singular values brought near 1. The Gram matrices
+    (K, K) of N matrices whose shorter side has the same size K are processed as one batch
+    (N, K, K).
+
+    `coefficients`, `steps` and `min_norm`: the iteration's polynomial, number of iterations and
+    least divisor, as in `orthogonalize`.
+    """
     all_of = list(matrices)
     wide = [_wide(matrix, min_norm) for matrix in all_of]
     of_size: dict[int, list[int]] = {}
@@ -229,7 +238,7 @@ def orthogonalize_together(
 def orthogonalize(
     matrix: Tensor, coefficients: Coefficients, steps: int, min_norm: float
 ) -> Tensor:
-    """`matrix` (F, C) with its singular values brought near 1.
+    """Return `matrix` (F, C) with its singular values brought near 1.
 
     Takes `steps` Newton-Schulz iterations with the quintic polynomial of the three `coefficients`
     (Jordan et al. 2024). The matrix is first divided by its norm, or by `min_norm` if that is
@@ -240,8 +249,9 @@ def orthogonalize(
 
 
 def gram_polynomial(gram: Tensor, coefficients: Coefficients, steps: int) -> Tensor:
-    """The matrix by which `steps` Newton-Schulz iterations multiply a matrix with the Gram matrix
-    `gram`: a polynomial of `gram`. Both have the shape (F, F), or (N, F, F) for N matrices."""
+    """Compute the matrix by which `steps` Newton-Schulz iterations multiply a matrix whose Gram
+    matrix is `gram`. The result is a polynomial of `gram`; both have the shape (K, K), or (N, K, K)
+    for N matrices."""
     first, second, third = coefficients
     add_product = torch.addmm if gram.ndim == 2 else torch.baddbmm
     product: Tensor | None = None

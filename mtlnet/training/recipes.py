@@ -168,19 +168,19 @@ DECAY, DECAY_STEPS = 0.9, 10_000
 
 
 def find_recipe(name: str) -> Recipe:
-    """The recipe with this name. Raises UserError when there is none."""
+    """Return the recipe called `name`. Raises UserError when there is none."""
     if name not in RECIPES:
         raise UserError(f"there is no recipe {name!r}; choose one of {', '.join(RECIPES)}")
     return RECIPES[name]
 
 
 def frozen_convolutions(recipe: Recipe, progress: float) -> int:
-    """Number of first convolutions that are frozen at `progress` in [0, 1] of the run."""
+    """Return how many of the first convolutions are frozen at `progress` in [0, 1] of the run."""
     return max((count for share, count in recipe.freeze_schedule if progress >= share), default=0)
 
 
 def learning_rate_factor(recipe: Recipe, batch: int) -> float:
-    """Ratio of the learning rate for `batch` images per step to the recipe's own.
+    """Return the ratio of the learning rate for `batch` images per step to the recipe's own.
 
     SGD: the ratio r of the batch sizes (Goyal et al. 2017, "Accurate, Large Minibatch SGD"). AdamW
     and Muon: sqrt(r), because the length of their steps does not depend on the length of the
@@ -193,7 +193,7 @@ def learning_rate_factor(recipe: Recipe, batch: int) -> float:
 
 
 def learning_rate(recipe: Recipe, step: int, progress: float) -> float:
-    """Learning rate at `step`, at `progress` in [0, 1] of the run."""
+    """Return the learning rate at step number `step`, at `progress` in [0, 1] of the run."""
     if recipe.optimizer == "sgd":
         return recipe.learning_rate * DECAY ** (step // DECAY_STEPS)
     peak = recipe.learning_rate

@@ -159,7 +159,7 @@ def prepare(
     device: torch.device,
     rank: Rank,
 ) -> tuple[Trainer, Loader]:
-    """The trainer before its first step, and the loader of its batches.
+    """Make the trainer, before its first step, and the loader of its batches.
 
     `init`: folder and card of the model whose weights the network gets. None: new weights, which
     the caller may replace by the weights of a checkpoint.
@@ -196,7 +196,7 @@ def prepare(
 
 
 def road_ahead(data: TrainingData, device: torch.device) -> RoadAhead | None:
-    """The labels of the road ahead for recorded rounds; None for a user's own pictures.
+    """Open the labels of the road ahead for recorded rounds; None for a user's own pictures.
 
     For training on a GPU the labels of all frames are read in advance.
     """

@@ -41,7 +41,7 @@ class TrainingData:
     """Description of the data: the `data` field of the model card."""
 
     def spread_images(self, count: int) -> NDArray[np.uint8]:
-        """At most `count` RGB images (B, 210, 280, 3) uint8, evenly spaced over the frames."""
+        """Read at most `count` RGB images (B, 210, 280, 3) uint8, evenly spaced over the frames."""
         count = min(count, len(self.frames))
         rows = np.linspace(0, len(self.frames) - 1, count).astype(np.int64)
         return self.frames.read_batch(rows, np.empty((count, HEIGHT, WIDTH, 3), np.uint8))
@@ -87,7 +87,7 @@ def open_training_data(
 
 
 def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "") -> TrainingData:
-    """A user's own pictures, rectified to the camera of the model `card`.
+    """Open a user's own pictures in `folder`, rectified to the camera of the model `card`.
 
     `drives`: names of drives to leave out, separated by commas. Raises UserError if `card` is None.
     """
@@ -113,7 +113,8 @@ def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "")
 
 
 def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, list[str]]:
-    """The images without the drives named in `drives`, and the names of these drives.
+    """Return the images without the drives named in `drives` (separated by commas), and the names
+    of these drives.
 
     The drives left out are not used at all: neither for the weights nor for the standard
     deviations. Raises UserError for a drive without pictures, and when no drive is left.
@@ -133,8 +134,8 @@ def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, li
 
 
 def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:
-    """The train rounds of a dataset; `skip_undecodable` leaves out frames that cannot be
-    decoded."""
+    """Open the train rounds of a dataset, some of them held out for the fit of the uncertainty
+    head. With `skip_undecodable`, frames that cannot be decoded are left out."""
     frames, held_out = hold_out_rounds(dataset)
     left_out: list[str] = []
     if skip_undecodable:
@@ -147,8 +148,9 @@ def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) 
 
 
 def continue_from_model(data: TrainingData, card: ModelCard) -> TrainingData:
-    """`data`, for training the model of `card` further. Its description `about` gets the model's
-    name, and the data on which that model was trained."""
+    """Return `data` for training the model of `card` further. In the result the description `about`
+    also has the model's name and hash, and the datasets, tracks and seeds on which the model was
+    trained."""
     about = {
         **_with_seen(data.about, card.data),
         "init": _origin(card),
@@ -163,8 +165,8 @@ def resume_data(
     earlier: dict[str, Any],
     start: ModelCard | None = None,
 ) -> TrainingData:
-    """The data of a resumed run. If the run used another dataset before, its description is added
-    to `about`.
+    """Return the data of a resumed run. If the run was trained on another dataset before, the
+    description `about` of the result also has an entry for that dataset.
 
     `earlier`: the description of the run's data so far. `start`: the model whose weights the run
     needs again, because it has no checkpoint. Raises ModelError when `start` is another model than
@@ -209,7 +211,8 @@ def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]
 
 
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
-    """Raise ModelError unless the data of a resumed run is the same as at its start."""
+    """Raise ModelError unless `data`, the description of a resumed run's data, has the same content
+    hash and split as `resumed`, the description stored when the run was started."""
     for name in ("content_hash", "split"):
         if resumed.get(name) != data.get(name):
             raise ModelError(

@@ -15,7 +15,7 @@ class AlphaError(UserError):
 
 
 def parse_alpha(text: str) -> Alpha:
-    """The weights of the three tasks, parsed from `text` of the form "distance,angle,class".
+    """Parse the weights of the three tasks from `text` of the form "distance,angle,class".
 
     A weight is 0 or more, and 0 leaves a task out; the weights can have any sum. Raises AlphaError.
     """
@@ -40,7 +40,7 @@ def parse_alpha(text: str) -> Alpha:
 
 
 def require_method(name: str) -> str:
-    """Return `name` if it is one of `METHODS`. Raises UserError otherwise."""
+    """Return `name` if it is "fixed", "uncertainty" or "dwa". Raises UserError otherwise."""
     if name not in METHODS:
         raise UserError(f"there is no balance {name!r}; choose one of {', '.join(METHODS)}")
     return name

@@ -26,11 +26,12 @@ def bins_loss(
     total: Callable[[Terms], Tensor],
     auxiliary: Tensor | None = None,
 ) -> Losses:
-    """The losses of `scores` of B images for the targets `coded` (B, 6) and `heading` (B,).
+    """Compute the losses of `scores` of B images for the targets `coded` (B, 6) and `heading` (B,).
 
-    `total` computes the weighted sum of the tasks' terms; `auxiliary` () is added to this sum. The
-    reported losses are squared errors of the coded answers, as for networks without bins. An
-    unknown distance (NaN) or class (`UNKNOWN_HEADING`) adds no loss.
+    `total`: function that computes the sum that training minimises from the tasks' three terms. The
+    scalar `auxiliary` is added to this sum. The reported losses of distance and angle are squared
+    errors of the coded answers, as for networks without bins. An unknown distance (NaN) or class
+    (`UNKNOWN_HEADING`) adds no loss.
     """
     known, weight = known_targets(coded)
     distances, angles = bin_targets(torch.where(known, coded, OFFSET))
@@ -55,7 +56,8 @@ def bins_loss(
 
 
 def mean_error(scores: Tensor, targets: Tensor) -> Tensor:
-    """Huber loss, in bins, of the difference between the means of B predicted distributions
-    (`scores` before softmax) and B target distributions, both (B, bins)."""
+    """Compute the Huber loss, in bins, of the differences between the means of B predicted
+    distributions (`scores` before the softmax) and B target distributions, both (B, bins). Returns
+    the mean over the B images, a scalar."""
     number = torch.arange(scores.shape[1], dtype=torch.float32, device=scores.device)
     return smooth_l1_loss(torch.softmax(scores, 1) @ number, targets @ number)

@@ -25,11 +25,11 @@ Terms = Sequence[Tensor]
 
 @dataclass(frozen=True)
 class Losses:
-    """The losses of a batch, each a tensor () if no shape is given.
+    """The losses of a batch; each is a scalar tensor, except `terms`.
 
-    `distance`, `angle`, `heading`: the losses of the tasks, in the units that are reported.
-    `total`: the weighted sum that training minimises. `terms` (3,): the tasks' terms of this sum
-    before their weights; their units can differ from the reported losses.
+    `distance` and `angle`: squared errors of the coded values. `heading`: cross-entropy of the
+    class. `total`: the weighted sum that training minimises. `terms` (3,): the tasks' terms of this
+    sum before their weights; they can have other units than the first three losses.
     """
 
     distance: Tensor
@@ -39,7 +39,7 @@ class Losses:
     terms: Tensor
 
     def row(self) -> Tensor:
-        """Distance, angle, class and total loss (4,), detached."""
+        """Return distance, angle, class and total loss (4,), detached."""
         return torch.stack([self.distance, self.angle, self.heading, self.total.detach()])
 
 
@@ -51,13 +51,14 @@ def multi_task_loss(
     target_variance: Tensor | None = None,
     huber: HuberLoss | None = None,
 ) -> Losses:
-    """The losses of `outputs` (B, 9) for the targets `coded` (B, 6) and `heading` (B,) int64.
+    """Compute the losses of `outputs` (B, 9) for the targets `coded` (B, 6) and `heading` (B,)
+    int64.
 
     `total`: computes the sum that training minimises from the tasks' terms (`TaskWeighting.total`).
-    `target_variance` (6,): variances of the coded targets. With it, the terms (not the reported
-    losses) are in units of these variances and averaged over the distances, so that a network that
-    predicts the mean has a loss of about 1 in every task. `huber`: replaces the squared errors by
-    Huber losses; it is used only with `target_variance`.
+    `target_variance` (6,): variances of the coded targets. With it, the terms
+    (not the reported losses) are in units of these variances and averaged over the distances, so
+    that a network that predicts the mean has a loss of about 1 in every task. `huber`: replaces the
+    squared errors by Huber losses; it is used only with `target_variance`.
     """
     known, weight = known_targets(coded)
     errors = torch.where(known, outputs[:, :6].float() - coded, 0.0)
@@ -77,16 +78,16 @@ def multi_task_loss(
 
 
 def known_targets(coded: Tensor) -> tuple[Tensor, Tensor]:
-    """The mask (B, 6) of the coded targets that are not NaN, and the factor () that turns a mean
-    over all distances into a mean over the known distances (1 if all are known)."""
+    """Return the mask (B, 6) of the coded targets that are not NaN, and the factor, a scalar, that
+    turns a mean over all distances into a mean over the known distances (1 if all are known)."""
     known = ~coded.isnan()
     each = known[:, :5]
     return known, each.numel() / each.sum().clamp_min(1)
 
 
 def heading_loss(scores: Tensor, heading: Tensor) -> Tensor:
-    """Cross-entropy of scores (B, 3) for classes (B,), mean over the known classes; 0 if no class
-    is known."""
+    """Compute the cross-entropy of scores (B, 3) for classes (B,), mean over the known classes; 0
+    if no class is known."""
     total = cross_entropy(scores, heading, ignore_index=UNKNOWN_HEADING, reduction="sum")
     return total / (heading != UNKNOWN_HEADING).sum().clamp_min(1)
 

@@ -49,11 +49,13 @@ class TaskWeighting:
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """Parameters to train together with the network's."""
+        """Parameters that are trained together with the network: the log variances (3,) for the
+        method `uncertainty`, else none."""
         return [self.log_variance] if self.method == "uncertainty" else []
 
     def total(self, terms: Terms) -> Tensor:
-        """The weighted sum () of the tasks' loss `terms`, which training minimises.
+        """Compute the weighted sum, a scalar, of the tasks' loss `terms`, which training minimises.
+        For the method `uncertainty` half the log variance of each task is added.
 
         A task with weight 0 has no part in the sum's autograd graph, so a network trained on one
         task is not influenced by other tasks.
@@ -66,7 +68,8 @@ class TaskWeighting:
 
     @torch.no_grad()
     def current_weights(self) -> list[float]:
-        """The factor of each task's loss term at this step; 0 for a task that is not learned."""
+        """Return the factor of each task's loss term at this step; 0 for a task that is not
+        learned."""
         if self.method != "uncertainty":
             return [float(weight) for weight in self.weights]
         factors = torch.tensor(LIKELIHOOD_FACTORS)
@@ -75,8 +78,11 @@ class TaskWeighting:
 
     @torch.no_grad()
     def update(self, terms: Tensor) -> None:
-        """Add the loss terms (3,) of a step, averaged over the whole batch, to the sums of the
-        window. After `window` steps, compute new weights. Does nothing unless the method is `dwa`.
+        """For the method `dwa`, add the loss `terms` (3,) of a step, averaged over the whole batch,
+        to the sums of the current window; for all other methods do nothing.
+
+        When the window has `window` steps, a new one begins. From the second window on, the end of
+        a window sets new weights.
         """
         if self.method != "dwa":
             return
@@ -95,7 +101,8 @@ class TaskWeighting:
         self.counts = torch.tensor([0, int(self.counts[1]) + 1])
 
     def state(self) -> dict[str, Tensor]:
-        """The tensors to store in a checkpoint, by their names in the file."""
+        """Return the tensors to store in a checkpoint, by the names under which `restore` reads
+        them."""
         return {
             "log_variance": self.log_variance.detach(),
             "current": self.weights,
