@@ -28,7 +28,9 @@ CHUNK = 32  # images read at once
 
 @dataclass(frozen=True)
 class FrameOutputs:
-    """Results of a frozen network on N frames.
+    """Results of a frozen network on N frames: inputs `x` (N, F) of the uncertainty head, of which
+    the last ten are the light features, `error` (N, 7) in m and rad, and texture features `texture`
+    (N, 1040).
 
     An error is NaN where the label or, for `to_lane_centre`, the prediction is absent.
     """
@@ -39,9 +41,11 @@ class FrameOutputs:
 
 
 def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
-    """Run `network` on up to `limit` evenly spaced frames.
+    """Run `network` on up to `limit` evenly spaced frames, and return the results that the fit of
+    the uncertainty head needs.
 
-    OpenVINO computes in the engine's precision if it is installed, else torch in float32.
+    If OpenVINO is installed, it computes them, in bf16 on a CPU that supports bf16 natively, else
+    in float32. Without OpenVINO torch computes them in float32.
     """
     chosen = np.linspace(0, len(frames) - 1, min(limit, len(frames))).astype(np.int64)
     run = _run_openvino if has_openvino() else _run_torch

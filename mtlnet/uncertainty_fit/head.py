@@ -99,8 +99,9 @@ def fit_uncertainty_head(
     """Fit the uncertainty head of `network` (folded) on its train frames and on held-out frames.
 
     Without held-out frames it is fitted on the train frames alone, and its standard deviations are
-    too small; the model card then lists no held-out rounds. In that case the light is no input of
-    the head, because so few rounds do not show enough sceneries.
+    too small; the model card then lists no held-out rounds. In that case the light features are not
+    inputs of the head, because so few rounds do not show enough sceneries. `camera`: the camera of
+    the frames; None: the default camera.
     """
     count = network.architecture.uncertainty_inputs
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)
@@ -152,9 +153,9 @@ def fit_uncertainty_head(
 def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
     """Fit the uncertainty head of the model in `run` again, on the train rounds of a dataset.
 
-    Its `about` also names the dataset and the seeds of these rounds. Raises ModelError for images
-    of another camera, and for rounds of the model's training, on which its errors are too small;
-    UserError for a dataset with too few rounds.
+    `about` of the result also names the dataset and the seeds of its train rounds. Raises
+    ModelError for images of another camera, and for rounds on which the model was trained, because
+    its errors on them are too small; UserError for a dataset with too few rounds.
     """
     card, dataset = read_card(run), open_training_dataset(data)
     # All rounds are new to the model, so the larger part takes the role of the held-out rounds.
@@ -186,12 +187,15 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
 def standardisation(
     x: NDArray[np.float32], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return mean (F,) and inverse standard deviation (F,) of inputs `x` (N, F), for `standardise`.
+    """Compute the mean (F,) and the inverse standard deviation (F,) of inputs `x` (N, F): the
+    arguments `centre` and `scale` of `mtlnet.model.uncertainty_head.standardise`.
 
-    The first `count` inputs are the network's, the remaining inputs the light. The standard
-    deviation of a network's input is raised to at least `MIN_FEATURE_STD_SHARE` of their mean
-    standard deviation: otherwise a unit that is 0 on these frames could be thousands of standard
-    deviations away on other frames. That of a light input is raised to at least `MIN_LIGHT_STD`.
+    The first `count` inputs come from the network, the remaining inputs are the light features. The
+    standard deviation of an input from the network is raised to at least a tenth of the mean
+    standard deviation of these inputs: otherwise a unit that is 0 on these frames could be
+    thousands of standard deviations away on other frames. The standard deviation of a light feature
+    is raised to at least 0.1 for a colour and 0.02 for a difference of brightness
+    (`MIN_LIGHT_STD`).
     """
     std = x.std(0)
     floor = max(MIN_FEATURE_STD_SHARE * float(std[:count].mean()), 1e-3)
@@ -202,13 +206,15 @@ def standardisation(
 def fit_std_layers(
     z: NDArray[np.float32], error: NDArray[np.float32], seed: int, held_out: FrameOutputs | None
 ) -> dict[str, NDArray[np.float32]]:
-    """Fit the layers that predict standard deviations; returns a part of `UncertaintyHead`'s state.
+    """Fit the layers that predict standard deviations; returns their tensors by name, a part of the
+    state of `UncertaintyHead`.
 
-    `z` (N, F): standardised inputs of the train frames, `error` (N, D): errors in m and rad;
-    `held_out`: held-out frames with standardised `x`. The layers are fitted on all frames.
-    Temperature scaling (Guo et al. 2017) brings the shares of errors within one and two standard
-    deviations near `COVERED`, by cross-validation: each of `FOLDS` parts of the held-out frames is
-    predicted by layers fitted without it.
+    `z` (N, F): standardised inputs of the train frames; `error` (N, D): errors in m and rad;
+    `held_out`: outputs on held-out frames, whose inputs `x` are standardised too. The layers are
+    fitted on all frames. Temperature scaling (Guo et al. 2017) then brings the shares of errors
+    within one and two standard deviations near 68 % and 95 %. For this, each of 8 parts of the
+    held-out frames (without held-out frames, of the train frames) is predicted by layers fitted
+    without this part.
     """
     first_judged = 0 if held_out is None else len(z)
     if held_out is not None:

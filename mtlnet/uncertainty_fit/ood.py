@@ -68,11 +68,11 @@ FIT = FitSettings(steps=800, batch=256, learning_rate=3e-3, weight_decay=0.1)
 def fit_texture_distance(
     known: NDArray[np.float32], held_out: NDArray[np.float32], false_alarm_rate: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return mean (C,) and directions (C, C) of the Mahalanobis distance of texture values (N, C),
-    fitted on the `known` frames.
+    """Fit the Mahalanobis distance of texture values (N, C) on the frames `known`. Returns the mean
+    (C,) and a matrix of directions (C, C): the squared distance of x is |directions (x - mean)|^2.
 
-    The directions are scaled so that the squared distance exceeds 1 in a share `false_alarm_rate`
-    of the held-out frames.
+    The directions are scaled so that the squared distance exceeds 1 in at most a share
+    `false_alarm_rate` of the frames `held_out`.
     """
     mean, spread = known.mean(0), np.maximum(known.std(0), MIN_SPREAD)
     covariance = np.cov((known - mean) / spread, rowvar=False, ddof=min(1, len(known) - 1))
@@ -98,8 +98,8 @@ def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float
 def view_homography(camera: CameraParameters, pitch: float, log_zoom: float) -> NDArray[np.float64]:
     """Return the homography (3, 3) from pixels of `camera` to pixels of a camera with another view.
 
-    The other camera is pitched down by `pitch` (rad) and sees exp(`log_zoom`) times as far to the
-    sides.
+    The second camera is pitched down by `pitch` (rad), and the tangents of half its field of view
+    are exp(`log_zoom`) times as large.
     """
     u0, v0 = (camera.width - 1) / 2, (camera.height - 1) / 2
     scale = np.exp(-log_zoom)
@@ -152,12 +152,13 @@ def fit_pitch_offset(
     false_alarm_rate: float,
     seed: int,
 ) -> dict[str, NDArray[np.float32]]:
-    """Fit the pitch regressor; returns the `pitch*` part of the state of
-    `UncertaintyHead`.
+    """Fit the two layers that predict the camera's pitch from centre texture features; returns
+    their tensors by name, a part of the state of `UncertaintyHead`.
 
     `known` (N, M), `held_out` (K, M): centre texture features of unchanged frames; `views`: the
-    result of `pitched_views`. The regressor's result is scaled so that its absolute value exceeds 1
-    in a share `false_alarm_rate` of the held-out frames.
+    result of `pitched_views`, features (V, M) and pitches (V,) in rad. The prediction is shifted
+    and scaled so that its median over the held-out frames is 0, and its absolute value exceeds 1 in
+    at most a share `false_alarm_rate` of them.
     """
     x = np.concatenate([known, views[0]])
     target = np.concatenate([np.zeros(len(known), np.float32), views[1] / PITCH_UNIT_RAD])[:, None]
