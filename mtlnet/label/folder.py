@@ -36,7 +36,8 @@ KEPT = ("drive", "light", "camera", "std_m", "std_rad")
 
 
 class LabelFolder:
-    """A folder with pictures. A picture is addressed by its index in the fixed list `files`."""
+    """A folder with pictures to label. A picture is addressed by its index in the list `files`,
+    which does not change."""
 
     def __init__(self, folder: Path, camera_file: Path | None, model: CameraParameters) -> None:
         """Find the pictures in `folder` and its subfolders, and check `labels.csv`.

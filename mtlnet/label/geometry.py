@@ -179,7 +179,7 @@ def marking_pixels(
     camera: CameraParameters, markings: Markings, along: ArrayLike = LINE_ALONG_M
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the pixels (N, 2) of the left and of the right marking at the distances `along` (N,)
-    m along the road; NaN where the camera does not see them."""
+    along the road, in m; NaN where the camera does not see them."""
     source = replace(camera, pitch_deg=markings.pitch_deg)
     found = []
     for distance in (markings.ml, markings.mr):

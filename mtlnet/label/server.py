@@ -1,8 +1,8 @@
 """The page of `mtlnet label FOLDER` and its JSON interface, on one local port.
 
-Pictures are addressed by number, so that a request names no file. Every request is checked as in
-the service (`runtime.access`): Host, Origin, and the token if there is one. The page itself
-contains no data and needs no token.
+Pictures are addressed by number, so that a request names no file. The headers Host and Origin of
+every request, and its token if one is required, are checked by the rules of the HTTP service
+(`runtime.access`). The page itself contains no data and needs no token.
 """
 
 import sys
