@@ -1,11 +1,11 @@
 """Distributions over bins for distances and angle: the targets, and the answer from the scores.
 
-A distance is a softmax over 70 bins of its range (`trackfeatures.RANGES`) and a class "absent"; the
-angle is a softmax over 100 bins. The target of a value is a normal distribution around it,
-integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother et al. 2024). The answer is
-the expectation over the likeliest bin and the 4 bins on each side of it. Where a distance jumps
-from one marking to the next, a regression would answer with a value in between; a distribution has
-two peaks, and the answer is at the higher one. `DISTANCE_BINS` is 70, `ANGLE_BINS` 100.
+A distance is a softmax over 70 bins (`DISTANCE_BINS`) of its range (`trackfeatures.RANGES`) and a
+class "absent"; the angle is a softmax over 100 bins (`ANGLE_BINS`). The target of a value is a
+normal distribution around it, integrated over each bin (HL-Gauss; Imani and White 2018, Farebrother
+et al. 2024). The answer is the expectation over the likeliest bin and the 4 bins on each side of
+it. Where a distance jumps from one marking to the next, a regression would answer with a value in
+between; a distribution has two peaks, and the answer is at the higher one.
 
 The functions are torch operations without branches, so that they can be part of an exported
 network.

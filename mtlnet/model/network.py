@@ -210,7 +210,7 @@ class SamePad(nn.Module):
 
 
 class Residual(nn.Sequential):
-    """Layers whose input is added to their output."""
+    """A sequence of layers whose input is added to its output."""
 
     def forward(self, x: Tensor) -> Tensor:
         y: Tensor = super().forward(x)  # type: ignore[no-untyped-call]  # torch leaves it untyped
