@@ -44,7 +44,7 @@ class DecodingErrors:
     size: tuple[int, int] | None = None
 
     def forget(self) -> None:
-        """Forget the errors so far."""
+        """Reset all fields, as if FFmpeg had reported no error."""
         self.count, self.first, self.unconverted, self.size = 0, "", "", None
 
     def new_size(self, shape: tuple[int, ...]) -> tuple[int, int] | None:

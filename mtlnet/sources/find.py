@@ -27,7 +27,7 @@ Note = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Source:
-    """One file, webcam or stream."""
+    """A source of images: one file, recording, webcam or stream."""
 
     path: Path
     kind: SourceKind = SourceKind.IMAGE

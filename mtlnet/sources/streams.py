@@ -51,8 +51,8 @@ def shown_name(given: str) -> str:
 
 @dataclass
 class Stream:
-    """An opened webcam or stream. After the last picture, `fault` describes why it ended too early,
-    or which pictures may be wrong. If `fault` is empty, `note` describes the normal end."""
+    """An opened webcam or stream. After the last picture, `fault` describes an early end or damaged
+    pictures; if it is empty, `note` describes the normal end."""
 
     name: str
     film: cv2.VideoCapture

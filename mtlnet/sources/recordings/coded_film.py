@@ -36,9 +36,10 @@ class CodedFilm:
         self._in_ivf = True
 
     def pictures(self, packets: Iterator[tuple[float, str, bytes]]) -> Iterator[Picture]:
-        """Yields the pictures of `packets`, each a message's time in s, format and data.
+        """Yields the pictures of `packets`, which are the time in s, the format ("h264", "h265",
+        "vp9" or "av1") and the data of each message.
 
-        Raises UserError for an unsupported format.
+        Raises UserError for an unsupported format, and if no picture can be decoded.
         """
         with TemporaryDirectory(prefix="driverview-") as folder:
             file = Path(folder) / "film"
