@@ -80,7 +80,7 @@ def open_pretrained(name: str | Path) -> tuple[Path, ModelCard]:
 
 
 def write_config(config: TrainConfig, recipe: Recipe, data: Mapping[str, Any]) -> None:
-    """Write `config.json` into the run's folder; `data` is the description of its dataset."""
+    """Write `config.json` into the run's folder; `data` is the description of the run's dataset."""
     values = {**asdict(config), "data": str(config.data), "out": str(config.out)}
     content = {
         "definitions": tf.VERSION,

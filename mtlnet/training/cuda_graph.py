@@ -31,11 +31,13 @@ class Recorder(Protocol):
         """Run `work` now, on the stream on which it will be recorded."""
 
     def record(self, work: Work) -> Work:
-        """Record `work` without running it; the returned function runs it on the same memory."""
+        """Record `work` without running it, and return a function that runs it on the memory that
+        it used when it was recorded."""
 
 
 class CudaRecorder:
-    """Records on a side stream, which torch.cuda.graph requires for backward passes."""
+    """Runs and records on a CUDA stream of its own, which torch.cuda.graph requires for backward
+    passes."""
 
     def __init__(self, device: torch.device) -> None:
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]  # torch's

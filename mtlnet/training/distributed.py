@@ -55,9 +55,10 @@ def read_rank() -> Rank:
 
 @contextmanager
 def process_group(rank: Rank, device: torch.device, batch: int) -> Iterator[None]:
-    """Connect the processes for the duration of the context.
+    """Connect the processes of a distributed training for the duration of the context; does nothing
+    for a single process.
 
-    Raises UserError when `batch`, the images per step, cannot be divided among them.
+    Raises UserError when `batch`, the images per step, cannot be divided among the processes.
     """
     if rank.world_size == 1:
         yield

@@ -55,12 +55,12 @@ def run_training(
     *,
     checked: bool = False,
 ) -> None:
-    """Train by `config` in the folder `config.out`, then call `finish`.
+    """Train with the configuration `config` in the folder `config.out`, then call `finish`.
 
     `resumed`: the stored description of the data of the run to resume; None starts a new run.
-    `checked`: the caller has decoded all images without an error. Raises UserError for unusable
-    data, an existing folder, a lack of memory or disk space, and a run that another process is
-    training; raises Stopped after Ctrl-C.
+    `report`: called with the progress every ten steps. `checked`: the caller has decoded all images
+    without an error. Raises UserError for unusable data, an existing folder, a lack of memory or
+    disk space, and a run that another process is training; raises Stopped after Ctrl-C.
     """
     find_recipe(config.recipe)  # raises when there is none
     rank = read_rank()
