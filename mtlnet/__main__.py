@@ -1,4 +1,4 @@
-"""`python -m mtlnet` is the `mtlnet` command."""
+"""Runs the `mtlnet` command for `python -m mtlnet`."""
 
 from mtlnet.cli import main
 

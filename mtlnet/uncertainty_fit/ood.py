@@ -86,8 +86,9 @@ def fit_texture_distance(
 
 
 def draw_view(camera: CameraParameters, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a random pitch (rad, positive downwards) and log zoom of a view whose image centre
-    lies within the frame."""
+    """Return a random pitch (rad, positive downwards) and zoom of a view whose image centre lies
+    within the frame. The zoom is the logarithm of the ratio of the tangents of half the field of
+    view."""
     while True:
         pitch = rng.uniform(-MAX_PITCH_RAD, MAX_PITCH_RAD)
         log_zoom = rng.uniform(-MAX_LOG_ZOOM, MAX_LOG_ZOOM)
