@@ -29,10 +29,11 @@ TRIES = 12
 
 @dataclass(frozen=True)
 class Bridge:
-    """One bridge over the road at `s` (m). `place` (3,) m and `heading` (rad) give its frame in the
-    world. `triangles` (n, 12) are world vertices in the layout of `solids`. `boxes` (m, 2, 3) cast
-    the shadow: least and greatest corner of each box in the bridge's frame. `half_along` and
-    `half_across` are the half sides (m) of the footprint."""
+    """One bridge over the road at `s` (m). `place` (3,), m, and `heading`, rad, are the pose of the
+    bridge's frame in the world. `triangles` (n, 12) are world vertices, three a triangle: position,
+    normal, colour, u, v, material number. `boxes` (m, 2, 3), m, cast the shadow; each is given by
+    its least and greatest corner in the bridge's frame. The footprint is the rectangle within
+    `half_along` and `half_across` (m) of the bridge's origin."""
 
     s: float
     place: FloatArray
@@ -43,16 +44,16 @@ class Bridge:
     half_across: float
 
     def inside(self, points: FloatArray) -> FloatArray:
-        """Convert world points (..., 3) to the bridge's frame."""
+        """Return world points (..., 3), m, in the bridge's frame, in the same shape."""
         return self.turned(points - self.place)
 
     def turned(self, direction: FloatArray) -> FloatArray:
-        """Rotate world directions (..., 3) into the bridge's frame."""
+        """Return world directions (..., 3) rotated into the bridge's frame, in the same shape."""
         return np.asarray(direction @ _turn(self.heading))
 
     def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
-        """Return a mask of the points x, y (m, world) that lie within `margin_m` of the bridge's
-        footprint."""
+        """Return a mask of the world points x, y (m, arrays of one shape), in this shape. It is
+        True inside the bridge's footprint, extended by `margin_m` (m) on each side."""
         own = self.inside(np.stack([x, y, np.zeros_like(x)], axis=-1))
         along, across = np.abs(own[..., 0]), np.abs(own[..., 1])
         return (along < self.half_along + margin_m) & (across < self.half_across + margin_m)
@@ -71,7 +72,8 @@ def free_of(
     y: FloatArray,
     margin_m: float | FloatArray = KEEP_FREE_M,
 ) -> NDArray[np.bool_]:
-    """Return a mask of the points x, y (m, world) farther than `margin_m` from every bridge."""
+    """Return a mask of the world points x, y (m, arrays of one shape), in this shape. It is True
+    outside the footprints of all bridges, extended by `margin_m` (m) on each side."""
     free = np.ones(np.shape(x), dtype=np.bool_)
     for bridge in bridges:
         free &= ~bridge.near(x, y, margin_m)
@@ -79,8 +81,8 @@ def free_of(
 
 
 def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridge, ...]:
-    """Build the bridges of a scene, about one every `theme.bridge_every_m`, sorted by s. A bridge
-    is left out where it would touch another part of the track."""
+    """Build the bridges of a scene, sorted by s: about one every `theme.bridge_every_m` (m), at
+    least 140 m apart. A bridge is left out if none of 12 random positions has room for it."""
     if not theme.bridges:
         return ()
     length = ground.road.track.length_m

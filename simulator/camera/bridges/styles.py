@@ -1,8 +1,8 @@
 """Builds the triangles of bridges: decks, piers, railings, arches and gantries.
 
-The frame is the bridge's own: x along the road, y to the left, z up from the road's centre, metres.
-Each style is a function that adds parts to a `BridgeBuilder`, which holds the dimensions of the
-site.
+The bridge's frame has x along the road, y to the left and z up, in metres, with the origin on the
+road's centre line. Each function in STYLES adds the parts of one kind of bridge to a
+`BridgeBuilder`, which holds the width and heights of the place where the bridge stands.
 """
 
 from collections.abc import Callable
@@ -31,11 +31,11 @@ SPAN_BEYOND_M = {"overpass": 13.0, "railway": 5.0, "footbridge": 3.0, "wooden": 
 
 
 class BridgeBuilder:
-    """Collects the triangles of a bridge and the boxes that cast its shadow.
+    """Collects the triangles of a bridge and the boxes that cast its shadow, in the bridge's frame.
 
-    `wall` is the lateral offset of the wall line, `under` the least height of the deck's underside
-    and `ground` the height of the lowest terrain at the bridge's ends: metres from the centre of
-    the road.
+    All arguments are in m, relative to the road's centre. `wall` is the distance to the wall lines,
+    where the barriers stand. `under` is the least height of the deck's underside, `ground` the
+    height of the lowest terrain at the bridge's ends.
     """
 
     def __init__(self, wall: float, under: float, ground: float) -> None:
@@ -44,25 +44,28 @@ class BridgeBuilder:
         self._boxes: list[FloatArray] = []
 
     def box(self, size: Point, at: Point, colour: Point, material: float = PLAIN) -> None:
-        """Add a closed box of `size` (x, y, z), and its shadow. `at` is the middle of the box's
-        floor."""
+        """Add a closed box of `size` (x, y, z), m, and its shadow. `at` (x, y, z), m, is the middle
+        of the box's floor. `colour` is linear RGB, `material` a material number of `solids`."""
         self.box_without_shadow(size, at, colour, material)
         self.shadow_box(size, at)
 
     def box_without_shadow(
         self, size: Point, at: Point, colour: Point, material: float = PLAIN
     ) -> None:
-        """Add a closed box that casts no shadow, for parts too thin for a visible one."""
+        """Add a closed box of `size` (x, y, z), m, without a shadow, for parts that are too thin to
+        cast a visible shadow. `at` (x, y, z), m, is the middle of the box's floor."""
         self._parts.append(box(size, at, colour, material, floor=True))
 
     def shadow_box(self, size: Point, at: Point) -> None:
-        """Add a box that casts a shadow but is not drawn; `size` and `at` as in `box`."""
+        """Add a box of `size` (x, y, z), m, that casts a shadow but is not drawn. `at` (x, y, z),
+        m, is the middle of the box's floor."""
         half = np.array([size[0] / 2, size[1] / 2, 0.0])
         self._boxes.append(np.array([at - half, at + half + np.array([0.0, 0.0, size[2]])]))
 
     def face(self, corners: list[FloatArray], colour: Point, material: float) -> None:
-        """Add a face with four corners (3,), counter-clockwise seen from outside. Its texture
-        coordinates are metres from the first corner."""
+        """Add a face with four corners (3,), m, counter-clockwise seen from outside. `colour` is
+        linear RGB, `material` a material number of `solids`. The texture coordinates are metres
+        from the first corner."""
         right = corners[1] - corners[0]
         along = right / max(float(np.linalg.norm(right)), 1e-9)
         uv = []
@@ -73,8 +76,9 @@ class BridgeBuilder:
         self._parts.append(face(corners, uv, colour, material))
 
     def board(self, size: tuple[float, float], at: Point, colour: Point, facing: float) -> None:
-        """Add a lettered board of `size` (width, height) across the road, with the middle of its
-        lower edge at `at`. `facing` is 1 for traffic along +x, -1 for traffic along -x."""
+        """Add a lettered board of `size` (width, height), m, that stands across the road, with the
+        middle of its lower edge at `at` (x, y, z), m. `facing` is 1 if the board faces traffic
+        along +x, -1 if it faces traffic along -x."""
         wide, high = size
         left, up = np.array([0.0, facing * wide / 2, 0.0]), np.array([0.0, 0.0, high])
         front = np.array(at) - np.array([0.045 * facing, 0.0, 0.0])
@@ -85,11 +89,13 @@ class BridgeBuilder:
         self._parts.append(face(corners, letters, colour, BOARD))
 
     def triangles(self) -> FloatArray:
-        """Return all triangles as vertices (n, 12) in the layout of `solids`."""
+        """Return all triangles as vertices (n, 12), three a triangle: position, normal, colour, u,
+        v, material number."""
         return np.concatenate(self._parts)
 
     def boxes(self) -> FloatArray:
-        """Return the least and greatest corners of the boxes that cast a shadow, (m, 2, 3)."""
+        """Return the boxes that cast a shadow, (m, 2, 3): the least and the greatest corner of each
+        box in the bridge's frame, m."""
         return np.array(self._boxes).reshape(-1, 2, 3)
 
 
@@ -98,7 +104,8 @@ Style = Callable[[BridgeBuilder, np.random.Generator], None]
 
 
 def half_span(style: str, wall: float) -> float:
-    """Return half of a bridge's length (m) across the road, without its embankments."""
+    """Return half of the length (m) across the road of a bridge of `style`, a key of STYLES,
+    without embankments. `wall` (m) is the distance from the road's centre to the wall lines."""
     return wall + SPAN_BEYOND_M[style]
 
 
@@ -138,7 +145,7 @@ def _ring(x: float, y0: float, y1: float, z: float) -> list[FloatArray]:
 
 
 def overpass(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build a concrete road on rows of columns."""
+    """Add a concrete road on rows of columns to `builder`. `rng` gives the width and the colour."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, depth = float(rng.uniform(7.0, 9.0)), 1.1
     reach, colour = half_span("overpass", wall), _pick(rng, CONCRETE)
@@ -156,7 +163,8 @@ def overpass(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def railway(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build a railway bridge: steel plate girders on abutments of masonry."""
+    """Add a railway bridge of steel plate girders on masonry abutments to `builder`. `rng` gives
+    the colours."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach = 5.0, half_span("railway", wall)
     steel, stone = _pick(rng, STEEL), _pick(rng, STONE)
@@ -173,17 +181,19 @@ def railway(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def footbridge(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build a narrow steel footbridge with stairs on both sides."""
+    """Add a narrow steel footbridge with stairs on both sides to `builder`. `rng` gives the
+    colour."""
     _walkway(builder, "footbridge", _pick(rng, STEEL))
 
 
 def wooden(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build a wooden footbridge."""
+    """Add a wooden footbridge with stairs on both sides to `builder`. `rng` is not used."""
     _walkway(builder, "wooden", WOOD)
 
 
 def adverts(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build a footbridge with advertising boards along its whole length, as on race tracks."""
+    """Add a footbridge with advertising boards along its whole length to `builder`, as on race
+    tracks. `rng` gives the colour of the boards."""
     wall, under = builder.wall, builder.under
     _walkway(builder, "adverts", (0.30, 0.30, 0.31))
     reach, colour = half_span("adverts", wall), _pick(rng, ADVERTS)
@@ -225,7 +235,8 @@ def _stairs(builder: BridgeBuilder, y: float, top: float, ground: float, colour:
 
 
 def gantry(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build two posts and a beam with direction signs over the lanes."""
+    """Add a gantry to `builder`: two posts and a beam with two or three direction signs over the
+    lanes. `rng` gives the number and the colour of the signs."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     steel, reach = (0.34, 0.35, 0.36), wall + 0.8
     for y in (-reach, reach):
@@ -241,7 +252,8 @@ def gantry(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def arch(builder: BridgeBuilder, rng: np.random.Generator) -> None:
-    """Build a segmental arch of masonry under a level parapet."""
+    """Add a segmental arch of masonry under a level parapet to `builder`. `rng` gives the width and
+    the colour."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach, parts = float(rng.uniform(4.0, 6.0)), half_span("arch", wall), 20
     colour = _pick(rng, STONE)
