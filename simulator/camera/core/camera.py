@@ -39,7 +39,7 @@ HEADLIGHT_AT = (2.1, 0.0, 0.4)
 
 
 def check_size(width: int, height: int) -> None:
-    """Raises UserError unless pictures of `width` x `height` pixels can be drawn."""
+    """Raises UserError unless `width` and `height` are from 8 to MAX_SIZE (4096) px."""
     if not (8 <= width <= MAX_SIZE and 8 <= height <= MAX_SIZE):
         raise UserError(
             f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} pixels"
@@ -72,14 +72,14 @@ class _Shot:
 
 
 class Camera:
-    """A camera on a car that draws one scene: `road` with the scenery of `seed` under `light`.
-    `look` is the look of a varied road, None for the paper's roads.
+    """A camera on a car that draws one scene of `road`: the random scenery of `seed` under `light`.
+    `look` is the random paint, surface and roadside of `--roads varied`; None for `--roads paper`.
 
-    It keeps the last `scenes` scenes in graphics memory. All cameras of a process share one OpenGL
-    context (see `context`). Any thread may use them; they draw one after the other. The same road,
-    seed, light, pose and cars give the same bytes on the same renderer. Raises UserError for a
-    picture size out of range, NoRendererError without EGL, and ForkedRendererError in a process
-    that was forked from a process with a camera.
+    Up to `scenes` scenes stay in graphics memory, the last ones used. All cameras of a process
+    share one OpenGL context (see `context`). Any thread may use them, but only one draws at a time.
+    The same road, seed, light, look, pose and cars give the same bytes on the same renderer. Raises
+    UserError for a picture size out of range, NoRendererError without EGL, and ForkedRendererError
+    in a process that was forked from a process with a camera.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Camera:
         return self._loaded.light
 
     def change_scene(self, seed: int, light: Light, look: RoadLook | None = None) -> None:
-        """Switch to the scenery of `seed` under `light`, with another `look` of the same road."""
+        """Draw another scene of the road from now on, given by `seed`, `light` and `look`."""
         with self._graphics.turns:
             self._current = None
             found = self._cache.pop((seed, light, look), None)
@@ -149,7 +149,8 @@ class Camera:
     def render(
         self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
     ) -> Picture:
-        """Draw `view` from a car at `body_pose`; returns (height, width, 3) uint8 RGB.
+        """Draw `view`, one of VIEWS, from a car at `body_pose`; returns (height, width, 3) uint8
+        RGB.
 
         `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity (m, rad). `others`
         (n, 6) are the poses of other cars, with z on the ground below each car.
@@ -164,15 +165,14 @@ class Camera:
         *,
         near_s: float | None = None,
     ) -> dict[str, Picture]:
-        """Draw several views from one pose; returns the pictures by the names in `views`.
+        """Draw several pictures from one pose; returns them by their names in `views`.
 
-        "front" (or another of VIEWS) is the colour picture (height, width, 3) uint8, "front:depth"
-        the distance along the optical axis (height, width) float32 in metres, inf in the sky, and
-        "front:class" the index into CLASSES (height, width) uint8. Depth and class belong to the
-        surface at the pixel's centre; leaves and hedges count where they are more than half opaque.
-        `near_s` is the car's approximate position (m) along the road, to distinguish a bridge from
-        the road below it; None uses the position of the last picture. Raises UserError for an
-        unknown view or kind.
+        The name of a view (one of VIEWS) requests the colour picture (height, width, 3) uint8 RGB;
+        "VIEW:depth" the distance along the optical axis (height, width) float32, m, inf in the sky;
+        "VIEW:class" the index into CLASSES (height, width) uint8. Depth and class show the surface
+        at the pixel's centre, without leaves and hedges less than half opaque. `near_s` is the
+        car's approximate position (m) along the road, to distinguish a bridge from the road below
+        it; None means as in the last picture. Raises UserError for other names.
         """
         if near_s is not None:
             self._last_s = near_s
@@ -244,13 +244,13 @@ class Camera:
         return drawn if self._lens is None else self._lens.labels(drawn)
 
     def extrinsics(self, view: str = "front", body_pose: ArrayLike = (0.0,) * 6) -> FloatArray:
-        """Return the matrix E (4, 4) from the body frame to the camera frame: x right, y down, z
-        ahead, m.
+        """Return the matrix E (4, 4) from the body frame to the camera frame
+        (x right, y down, z ahead; m).
 
         E is constant for views mounted on the car. The views `chase` and `top` stay level, so their
-        matrices depend on the roll and pitch of `body_pose`. With the matrix K of `intrinsics`, K @
-        (E @ point)[:3] is (u, v, 1) times the depth, before lens distortion. Raises UserError for
-        an unknown view.
+        matrices depend on the roll and pitch of `body_pose` (6,). With the matrix K of
+        `intrinsics`, K @ (E @ (x, y, z, 1))[:3] is depth * (u, v, 1), before lens distortion.
+        Raises UserError for an unknown view.
         """
         return optics.extrinsics(self.parameters, body_pose, view)
 
@@ -275,7 +275,8 @@ class Camera:
         self.close()
 
     def shadow_fraction(self, body_pose: ArrayLike) -> float:
-        """Return the share (0 to 1) in hard shadow of the road within 30 m ahead of the car."""
+        """Return the share (0 to 1) of the asphalt up to 30 m ahead of the car that is in hard
+        shadow."""
         pose = np.asarray(body_pose, dtype=np.float64)
         s = self._s_of(float(pose[0]), float(pose[1]))
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
@@ -329,8 +330,9 @@ class Camera:
 
 
 def open_camera(road: Road, parameters: CameraParameters, *, light: str, seed: int) -> Camera:
-    """Make a camera for a kind of light. `seed` determines the scenery, the parameters of the light
-    and, on a varied road, the look."""
+    """Make a camera for `light`, one of the kinds of light. `seed` determines the scenery, the
+    parameters of the light and, on a road of `--roads varied`, the random paint, surface and
+    roadside."""
     drawn = Light.named(light, np.random.default_rng([seed, 2]))
     look = RoadLook.drawn(seed) if road.carriageway else None
     return Camera(road, parameters, seed=seed, light=drawn, look=look)

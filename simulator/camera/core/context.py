@@ -91,7 +91,8 @@ class Graphics:
         self.targets = Targets(self.context, samples)
 
     def begin(self, target: Target, labels: bool = False) -> None:
-        """Clear `target`, bind it for drawing, and bind the shared textures."""
+        """Clear `target`, bind it for drawing, and bind the shared textures. `labels` is True for a
+        target of depth and class, False for a target of colours."""
         target.clear(labels)
         self.context.enable_only(self.context.DEPTH_TEST)
         self.use_textures()
@@ -107,7 +108,8 @@ class Graphics:
         self.context.blend_func = (self.context.SRC_ALPHA, self.context.ONE_MINUS_SRC_ALPHA)
 
     def uniform(self, program: str, name: str) -> "moderngl.Uniform":
-        """Return a uniform of a program in `programs`. Raises TypeError if it is none."""
+        """Return the uniform `name` of `program`, a key of `programs`. Raises TypeError if the
+        program's member `name` is not a uniform."""
         import moderngl
 
         member = self.programs[program][name]
@@ -126,8 +128,8 @@ class Graphics:
         return key
 
     def label_program(self, name: str) -> str:
-        """Return the key in `programs` of the program that draws depth and class of the geometry of
-        program `name`; compile it on first use."""
+        """Return the key in `programs` of the program that draws the same geometry as program
+        `name`, but depth and class of each pixel instead of colours; compile it on first use."""
         program, *features = name.split()
         kept = [VARIED] if VARIED in features else []
         key = " ".join([program, *kept, "labels"])
@@ -265,7 +267,8 @@ def _load_triton_first() -> None:
 
 
 def noise_tile() -> NDArray[np.uint8]:
-    """Return tileable RGBA noise (256, 256, 4): grain, fine patches, broad patches, crack lines."""
+    """Return tileable noise (256, 256, 4) uint8. The channels are grain, fine patches, broad
+    patches and crack lines, in the order R, G, B, A."""
     rng = np.random.default_rng(20240607)
     grain = _levelled(_filtered(rng, 0.35))
     fine = _levelled(_filtered(rng, 1.15))

@@ -18,14 +18,15 @@ def visible_runs(
     planes: FloatArray,
     runs: NDArray[np.int64],
 ) -> int:
-    """Write the visible runs of indices into `runs` (at least N, 2) as first index and number of
-    indices; returns the number of runs.
+    """Write the visible runs of vertex indices into `runs` (at least N, 2), as first index and
+    number of indices; returns the number of runs.
 
-    Chunk k lies in the sphere `spheres[k]` (centre, radius; m, world). `eye` (3,) is the viewpoint,
-    `planes` (4, 3) are the inward normals of the side planes. `first` and `count` (levels, N) are
-    the chunks' runs at each level of detail; the first level whose reach exceeds the distance to
-    the sphere's near end is drawn. Chunks that end before `nearest` (m) are left out; adjacent
-    chunks are merged into one run.
+    `spheres` (N, 4) are the centres and radii (m, world) of spheres round the N chunks of a mesh.
+    `eye` (3,), m, is the viewpoint, `planes` (4, 3) are the inward normals of the side planes of
+    the view. `first` and `count` (levels, N) are the runs of the chunks at each level of detail,
+    finest first. A chunk is drawn at the first level whose entry of `reaches` (levels,), m, is not
+    less than the distance from the eye to the sphere. Chunks that lie completely within `nearest`
+    (m) of the eye are left out; adjacent runs are merged.
     """
     found, end = 0, -1
     for k in range(len(spheres)):
@@ -59,8 +60,9 @@ def visible_spheres(
     eye: FloatArray,
     planes: FloatArray,
 ) -> NDArray[np.int64]:
-    """Return the indices, nearest first, of at most `most` spheres that are in the frustum and
-    whose centres are within `reach` m of the eye."""
+    """Return the indices, nearest first, of at most `most` spheres that intersect the view frustum
+    and whose centres are within `reach` (m) of the eye. `centres` (N, 3), `radii` (N,) and `eye`
+    (3,) are in m, world; `planes` (4, 3) are the inward normals of the side planes."""
     chosen = np.empty(len(centres), dtype=np.int64)
     distance = np.empty(len(centres))
     found = 0

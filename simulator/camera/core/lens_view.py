@@ -1,6 +1,6 @@
-"""Renders the picture of a lens with distortion: draws a pinhole view that covers the lens's field
-of view, then looks up each pixel of the picture in it. Pixel coordinates; centres of pixels are
-whole."""
+"""Renders the picture of a lens with distortion. A pinhole view that covers the lens's field of
+view is drawn first; each pixel of the picture is then looked up in this view. Pixel coordinates are
+whole numbers at the centres of pixels."""
 
 from dataclasses import dataclass, replace
 from math import ceil, cos, radians
@@ -27,9 +27,10 @@ Picture = NDArray[Any]
 
 @dataclass(frozen=True)
 class LensView:
-    """The pinhole view `drawn` for a camera with distortion, and the position (u, v) px in it of
-    each pixel of the camera, (2, SAMPLES H, SAMPLES W) for colours and (2, H, W) for depth and
-    class."""
+    """The pinhole view `drawn` that stands in for a camera (H x W px) with distortion.
+    `label_places` (2, H, W) are the positions (u, v), px, in the pinhole view of the camera's
+    pixels. `colour_places` (2, 2 H, 2 W) are the positions of 2 x 2 points in each pixel, whose
+    colours are averaged."""
 
     drawn: CameraParameters
     colour_places: NDArray[np.float32]
@@ -49,7 +50,8 @@ class LensView:
         return cls(drawn, *places)
 
     def colours(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the picture of the lens (H, W, 3) from the drawn pinhole view `picture`."""
+        """Return the picture (H, W, 3) of the lens from `picture`, the drawn pinhole view
+        (rows, columns, 3)."""
         u, v = self.colour_places
         found = cv2.remap(picture, u, v, cv2.INTER_LINEAR)
         height, width = self.label_places.shape[1:]
@@ -58,8 +60,9 @@ class LensView:
         )
 
     def labels(self, labels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return depth and class (H, W, 2) seen through the lens from the drawn pinhole view
-        `labels`; outside the lens's field of view they are infinity and sky."""
+        """Return depth and class (H, W, 2) seen through the lens from `labels`, the depth and class
+        (rows, columns, 2) of the pinhole view. Pixels outside the lens's field of view have
+        infinite depth and the class "sky"."""
         u, v = self.label_places
         found = cv2.remap(
             labels,

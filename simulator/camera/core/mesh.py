@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Surface:
-    """A triangle mesh: `vertices` (N, F) float32, `indices` uint32 and the chunks for culling."""
+    """A triangle mesh: `vertices` (N, F) float32 with F values each, `indices` (3 T,) uint32 of the
+    vertices of T triangles, and `chunks`, the parts for culling."""
 
     vertices: NDArray[np.float32]
     indices: NDArray[np.uint32]
@@ -26,9 +27,10 @@ class Surface:
 
 @dataclass(frozen=True)
 class Chunks:
-    """Parts of a mesh that are culled as a whole, by the spheres round their bounding boxes. `low`,
-    `high` (N, 3): corners of the boxes, m. `first`, `count` (levels, N): first index and number of
-    indices per level of detail, finest first; level k is drawn up to `reaches[k]` m."""
+    """Parts of a mesh. Each is culled as a whole, by the sphere round its bounding box. `low` and
+    `high` (N, 3), m, are the least and greatest corners of the boxes. `first` and `count`
+    (levels, N) are the first index and the number of indices of each part at each level of detail,
+    finest first. Level k is drawn up to `reaches[k]` (m) from the eye."""
 
     low: FloatArray
     high: FloatArray
@@ -61,14 +63,15 @@ class Mesh:
         self._runs = np.empty((len(self._spheres), 2), dtype=np.int64)
 
     def visible(self, eye: FloatArray, planes: FloatArray) -> list[list[int]]:
-        """Return the runs (first index, count) of indices that are visible from `eye` (3,) within
-        the side planes `planes` (4, 3)."""
+        """Return the runs (first index, number of indices) that are visible from `eye` (3,), m,
+        world. `planes` (4, 3) are the inward normals of the side planes of the view."""
         found = visible_runs(self._spheres, *self._levels, eye, planes, self._runs)
         runs: list[list[int]] = self._runs[:found].tolist()
         return runs
 
     def draw(self, runs: list[list[int]], labels: bool) -> None:
-        """Draw the visible runs: depth and class if `labels`, else colours."""
+        """Draw the `runs` (first index, number of indices), as depth and class if `labels`, else as
+        colours."""
         array = self._arrays[labels]
         for first, count in runs:
             array.render(vertices=count, first=first)

@@ -41,7 +41,8 @@ class Eye:
 
 @compiled
 def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """Return the rotation (3, 3) from body to world, as PyBullet's getMatrixFromQuaternion does."""
+    """Return the rotation matrix (3, 3) from the body frame to the world, Rz(yaw) Ry(pitch)
+    Rx(roll), angles in rad. PyBullet's getMatrixFromQuaternion gives the same matrix."""
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -55,7 +56,8 @@ def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
 
 
 def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
-    """Return the eye of `view` on a car at `body_pose` (6,). Raises UserError for unknown views."""
+    """Return the pose in the world of the camera that shows `view` from a car at `body_pose` (6,).
+    Raises UserError unless `view` is one of VIEWS."""
     pose = np.asarray(body_pose, dtype=np.float64)
     yaw = float(pose[5])
     if view == "chase":

@@ -42,6 +42,6 @@ class ViewRequest:
 
 
 def bounded(picture: NDArray[Any]) -> NDArray[Any]:
-    """Replace infinite depth (the sky) by FAR_M, in place, if `picture` is a depth image (float32);
-    other images are returned unchanged."""
+    """Replace infinite depth (the sky) by FAR_M (6000 m) if `picture` is a depth image (float32),
+    and return the same array. Other images are returned unchanged."""
     return np.minimum(picture, FAR_M, out=picture) if picture.dtype == np.float32 else picture

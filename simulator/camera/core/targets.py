@@ -22,14 +22,15 @@ _SKY = float(CLASSES.index("sky"))
 
 @dataclass(frozen=True)
 class Target:
-    """A framebuffer to draw in (multisampled), and the framebuffer that it is resolved to for
-    reading."""
+    """The framebuffer `drawn`, in which the scene is drawn, and the framebuffer `resolved`, which
+    is read. Without multisampling both are the same object."""
 
     drawn: "moderngl.Framebuffer"
     resolved: "moderngl.Framebuffer"
 
     def clear(self, labels: bool) -> None:
-        """Bind and clear the framebuffer. `labels`: clear to depth infinity and class sky."""
+        """Bind the framebuffer and clear it, to infinite depth and class "sky" if `labels`, else to
+        0."""
         self.drawn.use()
         if labels:
             self.drawn.clear(np.inf, _SKY)
@@ -55,7 +56,8 @@ class Target:
 
 
 class Targets:
-    """A cache of a context's targets, by size and kind; it keeps at most _KEPT targets."""
+    """A cache of the targets of one context, by size and by content (colours or labels). It keeps
+    at most 16 targets."""
 
     def __init__(self, context: "moderngl.Context", samples: int) -> None:
         self._context, self._samples = context, samples

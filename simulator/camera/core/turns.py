@@ -24,7 +24,7 @@ _LIBRARY: Final = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or "libEGL.so.1"
 
 
 class ForkedRendererError(UserError):
-    """Raised in a process that was forked from one that had used OpenGL; it cannot draw."""
+    """Raised when a forked process draws, if its parent had used OpenGL before the fork."""
 
 
 FORKED: Final = (
@@ -75,12 +75,12 @@ class Egl:
 
 
 class Turns:
-    """A `with` block makes the context current in its thread; other threads wait until the block
-    ends.
+    """Gives the OpenGL context to one thread at a time. A `with` block makes the context current in
+    its thread; other threads wait until the block ends.
 
-    Blocks may be nested. At the end of the outermost block, `free` is called and the context that
-    was current before is restored, because other libraries rely on it. A block costs 0.03 ms on
-    llvmpipe.
+    Blocks may be nested. At the end of the outermost block, the function `free` is called, which
+    frees unused OpenGL objects. Then the context that was current before the block is restored,
+    because other libraries rely on it. A block costs 0.03 ms on llvmpipe.
     """
 
     def __init__(self, egl: Egl, own: Current, free: Callable[[], object]) -> None:
@@ -112,8 +112,9 @@ class Turns:
             self._lock.release()
 
     def free_if_idle(self) -> None:
-        """Call `free` now, or leave it to the end of the open block. The method never waits, so the
-        garbage collector can call it in any thread; in a forked child it does nothing."""
+        """Free unused OpenGL objects: now, or at the end of the open `with` block if there is one.
+        The method never waits, so the garbage collector can call it in any thread. In a forked
+        child the method does nothing."""
         if not self._inherited and self._lock.acquire(blocking=False):
             try:
                 if self._depth == 0:
@@ -123,8 +124,9 @@ class Turns:
                 self._lock.release()
 
     def end(self) -> None:
-        """Stop all drawing at the end of the process: CPython aborts if it stops a daemon thread
-        inside OpenCV."""
+        """Stop all drawing by other threads at the end of the process, after at most 5 s of waiting
+        for the picture that is being drawn. A daemon thread that still ran inside OpenCV when
+        CPython stops the threads would abort the process."""
         if not self._inherited:
             self._lock.acquire(timeout=END_S)
 
