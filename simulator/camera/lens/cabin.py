@@ -48,8 +48,8 @@ def glass_of(look: RoadLook, light: Light, width: int, height: int) -> Glass:
 
 
 def surrounding_light(light: Light, night: bool) -> FloatArray:
-    """Return the displayed linear RGB of a grey surface in the open; at night only the sky
-    counts."""
+    """Return the displayed light (3,), linear RGB, of a grey surface outdoors. At night the light
+    of the sky is the only light."""
     sun = 0.0 if night else np.array(light.sun) * np.sin(light.sun_elevation)
     return np.asarray(0.5 * light.exposure * (np.array(light.sky) + sun))
 
@@ -62,8 +62,9 @@ def vignette(loss: float, width: int, height: int) -> FloatArray:
 
 
 def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
-    """Return the number of picture rows (W,), from the bottom, that the bonnet covers in each
-    column. The largest number is the share `cabin.bonnet` of the height."""
+    """Return the number of picture rows (W,), counted from the bottom, that the bonnet covers in
+    each column. Where the bonnet is highest, it covers the share `cabin.bonnet` of the picture's
+    height."""
     rng = np.random.default_rng([cabin.shape, 2])
     x = (np.arange(width) + 0.5) / width * 2.0 - 1.0 - rng.normal(0.0, 0.15)
     drop = rng.uniform(0.05, 0.9) * np.abs(x) ** rng.uniform(1.6, 4.5)

@@ -20,7 +20,7 @@ Plane = NDArray[np.float32]
 
 
 def noise_table() -> NDArray[np.int8]:
-    """Return normal noise (NOISE_SIZE,) int8, in units of 1 / NOISE_STEPS standard deviations."""
+    """Return standard normal noise (131072,) int8, in units of 1/32 standard deviation."""
     rng = np.random.default_rng(20261126)
     drawn = np.rint(rng.standard_normal(NOISE_SIZE) * NOISE_STEPS)
     return np.clip(drawn, -127, 127).astype(np.int8)
@@ -41,11 +41,12 @@ def develop(
     """Return `picture` (H, W, 3) with all effects applied, (H, W, 3).
 
     `gain` and `add` (H, W, 3) and the factor `exposure` apply to linear light, where 1 is the
-    brightest displayed value. `motion`: u, v (px) of the point that the car drives to, height of
-    the camera times focal length (m px), distance driven during the exposure (m). `glare`: u, v
-    (px) of the sun, and strength. `noise`: standard deviation in display values of 0 to 255, and
-    the seed of this picture. `normal`: table from `noise_table`. The tone curve is an S through 0,
-    0.5 and 1 of the display's range; its slope in the middle is 1 + `contrast`.
+    brightest displayed value. `motion` contains u, v (px) of the point that the car drives to, the
+    height of the camera times the focal length (m px), and the distance driven during the exposure
+    (m). `glare` contains u, v (px) of the sun and the strength of the glare. `noise` contains the
+    standard deviation, in display values of 0 to 255, and the seed of this picture; `normal` is the
+    table from `noise_table`. The tone curve is an S through 0, 0.5 and 1 of the display's range,
+    with the slope 1 + `contrast` in the middle.
     """
     height, width = picture.shape[0], picture.shape[1]
     out = np.empty_like(picture)

@@ -1,6 +1,8 @@
-"""Draws rain drops on the windscreen and the wiper that clears them. Pixels. The camera has no
-clock: the position along the road determines the position of the wiper and the number of drops that
-have fallen since its last stroke."""
+"""Draws rain drops on the windscreen, and the wiper that clears them, into pictures.
+
+There is no clock. The position along the road determines the position of the wiper, and the number
+of drops that have fallen since the wiper's last stroke. Coordinates are in pixels.
+"""
 
 import math
 from dataclasses import dataclass
@@ -43,10 +45,11 @@ class _Drops:
 
 
 class Windscreen:
-    """The wet windscreen of one cabin: draws drops and wiper into pictures of one size."""
+    """Draws the rain drops and the wiper of one car's windscreen into pictures of one size."""
 
     def __init__(self, cabin: Cabin, cover: float, wipes: bool, size: tuple[int, int]) -> None:
-        """`cover`: largest share of the glass that drops cover; `size`: picture size (W, H), px."""
+        """`cover` is the largest share (0 to 1) of the glass that drops cover, `wipes` whether the
+        wiper moves, `size` the width and height of the pictures, px."""
         self._cabin, self._cover, self._wipes, self._size = cabin, cover, wipes, size
         width, height = size
         rng = np.random.default_rng([cabin.shape, 4])

@@ -35,7 +35,8 @@ DARK_NOISE = 1.8
 
 
 class Imaging:
-    """Effects of cabin, lens and sensor on the pictures of one camera, for a look and a light."""
+    """Applies the effects of cabin, lens and sensor to the pictures of one camera. `look` gives the
+    effects, `light` the light of the scene, `bridges` the places where the exposure adapts."""
 
     def __init__(
         self, look: RoadLook, light: Light, camera: CameraParameters, bridges: Sequence[Bridge]
