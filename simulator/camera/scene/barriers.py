@@ -1,5 +1,5 @@
-"""Barriers along both wall lines of the road: rails, walls, hedges and others, which change by
-section.
+"""Builds the barriers on both sides of the road, such as rails, walls and hedges. The kind of
+barrier changes from section to section.
 
 World frame, metres. The collision shapes of the walls are in `simulator.world.walls`.
 """
@@ -32,8 +32,8 @@ LEVELS = (Level(35.0, 0.005, 16.0), Level(120.0, 0.03, 32.0), Level(300.0, 0.1, 
 def build(
     road: Road, mesh: RoadMesh, theme: Theme, rng: np.random.Generator, roadside: Roadside
 ) -> Surface:
-    """Build the barriers of both sides. Their kinds are the theme's, or on each side the single
-    kind that `roadside` names."""
+    """Build the barriers of both sides as one surface. Each section has a random kind out of
+    `theme.barriers`. On a side for which `roadside` names a kind, all sections have that kind."""
     grids, profiles = [], []
     heights = np.where(GROWS, roadside.height, 1.0) * HEIGHT_M
     for side, column, only in zip(

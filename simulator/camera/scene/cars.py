@@ -189,8 +189,9 @@ class Cars:
         self._patch = context.vertex_array(graphics.programs["spot"], [(patch, "2f", "corner")])
 
     def visible(self, poses: FloatArray, eye: FloatArray, planes: FloatArray) -> NDArray[np.intp]:
-        """Return the indices of the cars of `poses` (n, 6) in the frustum, nearest first. `eye`
-        (3,) and `planes` (4, 3) as in `frustum_culling`."""
+        """Return the indices of the cars that are in the view frustum and within 350 m, nearest
+        first. `poses` (n, 6) are in m and rad, world. `eye` (3,), m, is the viewpoint, `planes`
+        (4, 3) are the inward normals of the side planes."""
         if len(poses) == 0:
             return np.empty(0, dtype=np.intp)
         relative = poses[:, :3] - eye
@@ -199,7 +200,8 @@ class Cars:
         return np.flatnonzero(inside)[np.argsort(distance[inside], kind="stable")]
 
     def draw(self, poses: FloatArray, paints: list[int], eye: FloatArray, labels: bool) -> None:
-        """Draw the cars at `poses` (n, 6); `paints` are their indices into PAINTS."""
+        """Draw the cars at `poses` (n, 6; m, rad), as depth and class if `labels`, else as colours.
+        `paints` are the cars' indices into PAINTS, `eye` (3,), m, is the viewpoint."""
         for pose, paint in zip(poses, paints, strict=True):
             self._stands[labels].write(_model_matrix(pose, eye).tobytes())
             self._paint.value = PAINTS[paint % len(PAINTS)]
@@ -208,7 +210,8 @@ class Cars:
             self._meshes[labels].render(vertices=count, first=first)
 
     def draw_shadows(self, poses: FloatArray, eye: FloatArray, light: Light) -> None:
-        """Draw the shadows of the cars on the ground. Blending must be enabled."""
+        """Draw the shadows on the ground of the cars at `poses` (n, 6; m, rad) within 120 m of
+        `eye` (3,), m. Blending must be enabled."""
         x, y, z = light.sun_direction
         fall = np.array([-x, -y]) / max(z, 1e-3)
         fall *= min(1.0, _LONGEST_SHADOW / max(float(np.hypot(*fall)), 1e-9))
@@ -225,7 +228,8 @@ class Cars:
 
 @lru_cache(maxsize=2)
 def shared_cars(graphics: Graphics, *features: str) -> Cars:
-    """Return these graphics' cars, created at first use; `features` as in `weather_program`."""
+    """Return the `Cars` of `graphics`, created at first use. `features` are the #defines of the
+    program that draws the cars, such as "night"."""
     return Cars(graphics, *features)
 
 

@@ -25,8 +25,9 @@ CANOPY, CANOPY_M = 0.55, 30.0
 
 @dataclass(frozen=True)
 class TreeShade:
-    """The share of sunlight that trees block from the terrain: `shade` (rows along y, columns along
-    x) on its grid, 0 to MOST_SHADE. It is smoothed, so single shadows are not resolved."""
+    """The share of sunlight that trees block from the terrain, 0 to 0.8: `shade` (rows along y,
+    columns along x) at the grid points of `terrain`. It is smoothed, so single shadows are not
+    resolved."""
 
     terrain: Terrain
     shade: FloatArray
@@ -52,8 +53,8 @@ class TreeShade:
         return cls(terrain, MOST_SHADE * (1.0 - np.exp(-shade / MOST_SHADE)))
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the share of sunlight that trees block at the points x, y (m, world), 0 to
-        MOST_SHADE. It is the value of the nearest grid point."""
+        """Return the share of sunlight, 0 to 0.8, that trees block at the world points x, y (m,
+        arrays of one shape). It is the value of the nearest grid point."""
         i, j, _ = self.terrain.grid.nearest(x, y)
         rows, columns = self.shade.shape
         return np.asarray(self.shade[np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)])
@@ -61,8 +62,9 @@ class TreeShade:
 
 @dataclass(frozen=True)
 class Span:
-    """A level of detail of the terrain. Its cells are `step` x `step` cells of the finest grid; it
-    is drawn from `start_m` to `reach_m`. `bare`: cells below the road mesh are drawn too."""
+    """A level of detail of the terrain, drawn from `start_m` to `reach_m` (m) from the eye. A cell
+    of this level covers `step` x `step` cells of the finest grid. `bare` is whether cells below the
+    road mesh are drawn."""
 
     step: int
     start_m: float
@@ -71,7 +73,8 @@ class Span:
 
 
 def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
-    """Build the terrain at one level of detail; it is nowhere higher than the finest level.
+    """Build the mesh of the terrain at the level of detail `span`. This mesh is nowhere higher than
+    the mesh of the finest level.
 
     `hidden` (rows, columns) marks the points of the finest grid that the road mesh covers.
     """
@@ -94,8 +97,8 @@ def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
 
 
 def lowered(z: FloatArray, step: int) -> FloatArray:
-    """Return every `step`-th height of `z` in both directions, lowered by the largest amount by
-    which the coarse triangles rise above the fine heights next to it."""
+    """Return the heights (m) of a coarse grid: every `step`-th height of `z` (rows, columns), m, in
+    both directions. Each is lowered so far that no coarse triangle rises above the fine heights."""
     kept = z[::step, ::step]
     if step == 1:
         return kept

@@ -52,7 +52,7 @@ class Light:
 
     @property
     def weather(self) -> str:
-        """The kind if it is one of WEATHERS, else ""."""
+        """The kind of light if it is "rain" or "snow", else ""."""
         return self.kind if self.kind in WEATHERS else ""
 
     @staticmethod

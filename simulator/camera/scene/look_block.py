@@ -84,7 +84,8 @@ def _surface_rows(surface: Surface) -> list[Row]:
 
 
 def surface_features(surface: Surface) -> tuple[str, ...]:
-    """Return the features of surface.glsl that this surface needs; unused ones would cost time."""
+    """Return the names of the features of surface.glsl that `surface` needs. The shader is compiled
+    without the remaining features, because they would cost time."""
     wanted = {
         "slabs": surface.other_tone > 0.0 or surface.concrete > 0.0,
         "repairs": surface.tar > 0.0 or surface.patches > 0.0,

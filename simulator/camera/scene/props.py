@@ -1,7 +1,8 @@
 """Builds the props beside the road: houses, grandstands, signs, marker posts, poles, lamps.
 
 Each prop is a template in its own frame: x along the road, y away from it, z up, metres. Templates
-are placed many times in the world frame (metres). Triangles are vertices (n, 12) as in `solids`.
+are placed many times in the world frame (metres). Triangles are vertices (n, 12), three a triangle:
+position, normal, colour, u, v, material number (see `solids`).
 """
 
 import math
@@ -54,7 +55,7 @@ _BOARDS: tuple[Point, ...] = (
 
 
 def house(rng: np.random.Generator) -> FloatArray:
-    """Build a house of one to three floors under a gabled roof."""
+    """Return the triangles (n, 12) of a house of one to three floors under a gabled roof."""
     wide, deep = rng.uniform(8.0, 15.0), rng.uniform(7.0, 10.0)
     high = 2.9 * rng.integers(1, 4) + 0.4
     wall, roof = _WALLS[rng.integers(len(_WALLS))], _ROOFS[rng.integers(len(_ROOFS))]
@@ -78,7 +79,7 @@ def house(rng: np.random.Generator) -> FloatArray:
 
 
 def grandstand(rng: np.random.Generator) -> FloatArray:
-    """Build a grandstand: rising tiers full of people under a roof."""
+    """Return the triangles (n, 12) of a grandstand: rising tiers full of people under a roof."""
     wide = float(rng.uniform(25.0, 45.0))
     colour = _BOARDS[rng.integers(len(_BOARDS))]
     parts = [box((wide, 1.0, 2.6), (0.0, -5.0, -1.0), colour)]
@@ -92,7 +93,7 @@ def grandstand(rng: np.random.Generator) -> FloatArray:
 
 
 def sign(rng: np.random.Generator) -> FloatArray:
-    """Build a board on two legs that faces traffic driving along +x."""
+    """Return the triangles (n, 12) of a board on two legs that faces traffic driving along +x."""
     wide, high = float(rng.uniform(0.8, 3.4)), float(rng.uniform(0.7, 1.5))
     foot = float(rng.uniform(1.3, 2.0))
     board = box((0.06, wide, high), (0.0, 0.0, foot), _BOARDS[rng.integers(len(_BOARDS))], BOARD)
@@ -107,12 +108,13 @@ def sign(rng: np.random.Generator) -> FloatArray:
 
 
 def marker_post() -> FloatArray:
-    """Build a white marker post with a dark band."""
+    """Return the triangles (n, 12) of a white marker post with a dark band."""
     return box((0.09, 0.12, 1.3), (0.0, 0.0, -0.3), (0.72, 0.72, 0.70), STRIPED)
 
 
 def apartment_block(rng: np.random.Generator) -> FloatArray:
-    """Build an apartment block of four to nine floors under a flat roof."""
+    """Return the triangles (n, 12) of an apartment block of four to nine floors under a flat
+    roof."""
     wide, deep = float(rng.uniform(12.0, 26.0)), float(rng.uniform(9.0, 13.0))
     high = float(2.9 * rng.integers(4, 10) + 0.4)
     wall = _WALLS[rng.integers(len(_WALLS))]
@@ -126,14 +128,15 @@ def apartment_block(rng: np.random.Generator) -> FloatArray:
 
 
 def pole() -> FloatArray:
-    """Build a wooden telegraph pole with two cross-arms."""
+    """Return the triangles (n, 12) of a wooden telegraph pole with two cross-arms."""
     wood, mast = (0.13, 0.09, 0.06), (0.22, 0.22, 9.0)
     arms = [box((0.12, 2.0, 0.12), (0.0, 0.0, z), wood) for z in (6.9, 7.6)]
     return np.concatenate([box(mast, (0.0, 0.0, -0.9), wood), *arms])
 
 
 def lamp(head: float = PLAIN) -> FloatArray:
-    """Build a lamp on a tall mast, its arm over the road (-y), its head of material `head`."""
+    """Return the triangles (n, 12) of a lamp on a tall mast. The arm points over the road (-y).
+    `head` is the material number of the lamp's head."""
     grey = (0.24, 0.25, 0.25)
     return np.concatenate(
         [
@@ -218,8 +221,9 @@ def build(
     rng: np.random.Generator,
     lit_every_m: float = 0.0,
 ) -> dict[str, Surface]:
-    """Build all props and bridges of a scene; returns a surface for each material. Lit lamps are
-    placed on the right side every `lit_every_m` (0: none)."""
+    """Build all props and bridges of a scene; returns one surface for each material, by the
+    material's name. Lit lamps are placed on the right side, one every `lit_every_m` (m), none if it
+    is 0."""
     placer = _Placer(ground, bridges)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)

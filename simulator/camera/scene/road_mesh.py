@@ -1,8 +1,8 @@
 """The triangle mesh of the road: rows of vertices across the track, each vertex with its (s, y).
 
 World frame, metres; s along the centre line, y left positive. Rows are so close that the chord
-between two rows deviates from the true arc by less than `SAGITTA_M`. So the paint that the shader
-draws at (s, y) lies where the track geometry has that point.
+between two rows deviates from the true arc by less than 2.5 mm. So the paint that the shader draws
+at (s, y) lies where the track geometry has that point.
 """
 
 from dataclasses import dataclass
@@ -40,8 +40,9 @@ error. The weight keeps the verge below the asphalt at every level of detail."""
 
 @dataclass(frozen=True)
 class RoadMesh:
-    """Vertices of the road. `s` (R,) are the rows, `y` (R, C) the lateral offsets of their columns,
-    left to right, and `points` (R, C, 3) the positions; m. `curvature` (R,) is in 1/m."""
+    """Vertices of the road in R rows and C columns. `s` (R,), m, are the positions of the rows
+    along the road, `y` (R, C), m, the lateral offsets of the vertices, from left to right, and
+    `points` (R, C, 3), m, the positions in the world. `curvature` (R,) is in 1/m."""
 
     s: FloatArray
     y: FloatArray
@@ -121,7 +122,8 @@ def _skirt(
 
 
 def covers(mesh: RoadMesh, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
-    """Return a mask (rows, columns) of grid points at least `margin_m` inside the mesh's edges."""
+    """Return a mask (rows, columns) of the grid points of `survey` that lie more than `margin_m`
+    (m) inside the outer edges of `mesh`."""
     row = np.clip(np.searchsorted(mesh.s, survey.line.s), 1, len(mesh.s) - 1)[survey.sample]
     reach = np.minimum(mesh.y[:, 0], -mesh.y[:, -1])
     return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
@@ -197,21 +199,24 @@ class Ground:
     def place_beside(
         self, s: FloatArray, offset: FloatArray, clear_m: float | FloatArray
     ) -> tuple[NDArray[np.bool_], FloatArray, FloatArray]:
-        """Return a mask of the points (s, offset) that lie at least `clear_m` outside all wall
-        lines, and x, y (m, world) of all points."""
+        """Return a mask of the points (`s`, `offset`), m, that lie more than `clear_m` (m) outside
+        the wall lines of every part of the track, and x, y (m, world) of all points. All arrays
+        have one shape. The wall lines are where the barriers stand."""
         pose = self.road.track.at(s, offset)
         near = self.line.distance(pose.x, pose.y)
         free = near > self.road.wall_offset + clear_m
         return free, pose.x, pose.y
 
     def is_clear(self, points: FloatArray, clear_m: float) -> bool:
-        """Return whether all points (n, 2) lie at least `clear_m` outside every wall line."""
+        """Return whether all points (n, 2), m, world, lie more than `clear_m` (m) outside the wall
+        lines of every part of the track."""
         near = self.line.distance(points[:, 0], points[:, 1])
         return bool((near > self.road.wall_offset + clear_m).all())
 
     def height(self, s: FloatArray, offset: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the visible height (m) at points, given as track and world coordinates: that of
-        the terrain, or of the road mesh's skirt if it is higher."""
+        """Return the visible height (n,), m, at points with the track coordinates `s`, `offset` and
+        the world coordinates `x`, `y`, each (n,), m. It is the height of the terrain, or of the
+        road mesh's skirt where the skirt is higher."""
         mesh = self.mesh
         row = np.clip(np.searchsorted(mesh.s, s), 0, len(mesh.s) - 1)
         skirt = mesh.ground(row, offset)

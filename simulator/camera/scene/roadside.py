@@ -1,4 +1,5 @@
-"""Applies the look of a varied road to its roadside: barriers, theme and parked cars. Metres."""
+"""Applies the look of a road of `--roads varied` to its barriers, scenery theme and parked cars.
+Lengths are in metres."""
 
 from dataclasses import dataclass, replace
 
@@ -32,14 +33,16 @@ class NearRoad(Road):
 
 
 def seen_road(road: Road, look: RoadLook | None) -> Road:
-    """Return the road to draw; its barriers are nearer if `look` sets a gap for them."""
+    """Return the road to draw. If `look.roadside.gap_m` is 0 or more, the drawn barriers may stand
+    nearer to the asphalt than the walls that cars hit."""
     if look is None or look.roadside.gap_m < 0.0:
         return road
     return NearRoad(road.track, road.lanes, road.lane_width, road.carriageway, look.roadside.gap_m)
 
 
 def seen_theme(theme: Theme, look: RoadLook | None) -> Theme:
-    """Return the scenery theme to draw: `theme` with `look`'s trees, grass, lamps and bridges."""
+    """Return the scenery theme to draw: `theme` with the trees, grass, lamps and bridges of `look`,
+    or `theme` itself if `look` is None."""
     if look is None:
         return theme
     roadside, lit = look.roadside, look.light.night and look.light.lamp_every_m > 0.0
@@ -61,8 +64,9 @@ def _mixed(one: Colour, other: Colour, share: float) -> Colour:
 
 
 def parked_cars(road: Road, every_m: float, rng: np.random.Generator) -> FloatArray:
-    """Return poses (n, 6), on the ground, of cars parked along `road`, on average every `every_m`.
-    They stand on the shoulder if it is wide enough, else beside the asphalt if there is room."""
+    """Return poses (n, 6; m, rad, world), on the ground, of cars parked along `road`, on each side
+    one every `every_m` (m) on average. They stand on the shoulder if it is at least 2.1 m wide,
+    else beside the asphalt if there is room. There are none if `every_m` is 0."""
     if every_m <= 0.0:
         return np.empty((0, 6))
     poses = []

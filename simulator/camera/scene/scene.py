@@ -49,7 +49,8 @@ class VisibleScene:
 
 
 class Scene:
-    """The static scene of one road, seed and light. `draw` uses the bound uniform block `Frame`."""
+    """The static scene of one road, seed and light. `draw` requires that the uniform block `Frame`
+    is bound."""
 
     def __init__(
         self,
@@ -111,7 +112,8 @@ class Scene:
         self._shadow_texture = graphics.texture(self.mask.texels)
 
     def visible(self, eye: Eye, planes: FloatArray) -> VisibleScene:
-        """Return the parts visible from `eye` within the side planes `planes` (4, 3)."""
+        """Return the parts visible from `eye`. `planes` (4, 3) are the inward normals of the side
+        planes of the view."""
         return VisibleScene(
             tuple((mesh, mesh.visible(eye.place, planes)) for mesh in self._solid),
             self._barriers.visible(eye.place, planes),
@@ -119,7 +121,8 @@ class Scene:
         )
 
     def draw(self, seen: VisibleScene, labels: bool) -> None:
-        """Draw all opaque parts but the sky, nearest first, so the depth test skips hidden
+        """Draw all opaque parts except the sky, as depth and class if `labels`, else as colours.
+        Parts that are usually near are drawn first, because the depth test then skips hidden
         pixels."""
         self._block.bind_to_uniform_block(SCENE_BINDING)
         if self._look is not None:
@@ -140,7 +143,9 @@ class Scene:
 def scene_block(
     road: Road, theme: Theme, rng: np.random.Generator, mask: shadow_mask.ShadowMask, sea: float
 ) -> NDArray[np.float32]:
-    """Return the uniform block `Scene` of frame.glsl, (10, 4) float32."""
+    """Return the uniform block `Scene` of frame.glsl, (10, 4) float32: the colours of `theme`,
+    varied at random by `rng`, the lanes and paint of `road`, the layout of the shadow `mask`, and
+    the sea level `sea` (m)."""
     marks, concrete = road.track.markings, road.track.surface == "concrete"
     tone = rng.uniform(0.72, 1.35)
     worn = float(np.clip(theme.worn * rng.uniform(0.4, 1.5), 0.0, 1.0))

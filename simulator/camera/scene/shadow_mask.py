@@ -1,7 +1,8 @@
 """Shadows of bridges and trees on the road: a mask over (s, y), from 0 in the sun to 255 in shadow.
 
-The mask is as wide as the road mesh and centred on y = 0. It is folded into bands of `BAND_TEXELS`
-along s, each with `GUARD` additional texels at both ends, so that a long track fits one texture.
+The mask is as wide as the road mesh and centred on y = 0. It is cut along s into bands of 4080
+texels, stacked so that a long track fits one texture. Each band has 8 additional texels at both
+ends.
 """
 
 import math
@@ -48,8 +49,9 @@ SKY_BLUR_M = 3.0
 
 @dataclass(frozen=True)
 class ShadowMask:
-    """The mask, unfolded as `strip` and folded as `texels` (bands * rows, BAND_TEXELS + 2 GUARD).
-    On varied roads the texels have a second component, the share of the sky that bridges hide."""
+    """The mask as one `strip` (rows, columns) along the track, and as the texture `texels`
+    (bands * rows, 4096), in which the bands are stacked. On roads of `--roads varied` the texels
+    have a second component, the share of the sky that bridges hide, 0 to 255."""
 
     strip: Strip
     texels: NDArray[np.uint8]
@@ -57,8 +59,8 @@ class ShadowMask:
     """Length of a texel along s; the track's length is a whole number of texels."""
 
     def fraction(self, s: float, half_width: float) -> float:
-        """Return the shadowed share of the road within `half_width` of its centre, for LOOK_M from
-        s."""
+        """Return the shadowed share (0 to 1) of the road within `half_width` (m) of its centre,
+        from `s` (m) to 30 m farther."""
         middle = self.strip.shape[0] // 2
         reach = min(int(half_width / TEXEL_M), middle)
         rows = self.strip[middle - reach : middle + reach]
@@ -85,10 +87,12 @@ def build(
     *,
     sky: bool = False,
 ) -> ShadowMask:
-    """Compute the shadows on `road` in `light`, cast by bridges and by trees or a closed canopy;
-    with `sky` also the share of the sky that bridges hide.
+    """Compute the shadows on `road` in `light`. Bridges cast shadows, and so do trees or, in the
+    light "heavy-shadow", a closed canopy. If `sky`, the share of the sky that bridges hide is
+    computed too.
 
-    At its sides the mask fades into the shade of `land`, so that no edge is visible.
+    At its sides the mask fades into `land`, the trees' shade on the terrain, so that no edge is
+    visible.
     """
     columns = max(GUARD, round(road.track.length_m / TEXEL_M))
     rows = 8 * int(np.ceil((road.wall_offset + SKIRT_M + 1.0) / TEXEL_M / 4.0))
@@ -249,7 +253,8 @@ def cast_bridges(
     bridges: Sequence[Bridge],
     light: Light,
 ) -> None:
-    """Darken the texels of `strip` (rows, columns), in place, from which a bridge hides the sun."""
+    """Darken the texels of `strip` (rows, columns), in place, from which a bridge hides the sun.
+    `along_m` is the length (m) of a texel along the road."""
     for bridge in bridges:
         sun = bridge.turned(np.array(light.sun_direction))
         low, high = _reach(bridge.boxes, sun)

@@ -20,8 +20,8 @@ _WIDTHS = (1024, 4096)
 
 
 class Sky:
-    """The sky of one light, for images with the focal length `focal_px`. When it is created, the
-    bound uniform block `Frame` must contain this light."""
+    """The sky of a scene in `weather`, for images with the focal length `focal_px`. The constructor
+    renders it with the light in the uniform block `Frame`, which must be bound."""
 
     def __init__(self, graphics: Graphics, weather: str, focal_px: float) -> None:
         context = graphics.context

@@ -1,7 +1,8 @@
 """Boxes and faces as triangles; props and bridges are built of them.
 
-A vertex has 12 values: position (3), normal (3), colour (3), texture coordinates u, v in metres,
-and material number. The frame is the object's own, z up, metres.
+A vertex has 12 values: position (3), normal (3), colour (3), texture coordinates u, v, and material
+number. The texture coordinates are in metres, on lettered boards in shares of the board's sides.
+The frame is the frame of the prop or bridge, z up, metres.
 """
 
 from collections.abc import Sequence
@@ -21,10 +22,10 @@ PLAIN, FACADE, CROWD, BOARD, STRIPED, TILES, MASONRY, EARTH, LIT = map(float, ra
 def box(
     size: Point, at: Point, colour: Point, material: float = PLAIN, *, floor: bool = False
 ) -> FloatArray:
-    """Return a box of `size` (x, y, z) as vertices (30, 12), or (36, 12) with its floor. `at` is
-    the middle of the floor.
+    """Return a box of `size` (x, y, z), m, as vertices (30, 12), or (36, 12) with its floor. `at`
+    (x, y, z), m, is the middle of the floor.
 
-    The sides have the `material`; top and floor too, but those of a facade box are plain.
+    All faces have the `material`, except that top and floor of a box of FACADE are PLAIN.
     """
     rows = _unit_box()[: 36 if floor else 30].copy()
     rows[:, :3] = rows[:, :3] * size + at
@@ -64,8 +65,9 @@ def _normal(a: FloatArray, b: FloatArray) -> FloatArray:
 def face(
     corners: Sequence[FloatArray], uv: Sequence[tuple[float, float]], colour: Point, material: float
 ) -> FloatArray:
-    """Return a face with four corners, counter-clockwise from outside, as two triangles (6, 12).
-    Two consecutive corners may be equal. `uv` are the texture coordinates of the corners."""
+    """Return a face with four corners (3,), m, counter-clockwise from outside, as two triangles
+    (6, 12). Two consecutive corners may be equal. `uv` are the texture coordinates of the corners,
+    `colour` is linear RGB, `material` a material number."""
     rows = np.empty((6, 12))
     order = [0, 1, 2, 0, 2, 3]
     rows[:, :3] = np.array(corners)[order]

@@ -45,12 +45,13 @@ def strip(
     cells: Sequence[Sequence[tuple[int, int]]],
     levels: Sequence[Level] = LEVELS,
 ) -> Surface:
-    """Build the triangles between the rows of a vertex grid (R, C, F) at `points` (R, C, 3), m. The
-    rows are at `s` (R,) m along the road.
+    """Build the triangles between the rows of a vertex grid (R, C, F), with F values a vertex, at
+    `points` (R, C, 3), m. The rows are at `s` (R,) m along the road.
 
     `profile` (R, K) contains the values, in metres, that interpolation between the kept rows must
-    reproduce. Level k joins the pairs of columns `cells[k]`. The first row of every chunk is kept,
-    so that neighbouring chunks of different levels share their vertices.
+    reproduce. At level of detail k there are triangles between the columns of each pair in
+    `cells[k]`. The first row of every chunk is kept, so that neighbouring chunks of different
+    levels share their vertices.
     """
     rows, columns = vertices.shape[:2]
     starts = np.arange(0, rows - 1, CHUNK_ROWS)

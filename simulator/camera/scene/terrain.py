@@ -36,7 +36,8 @@ BANK_SLOPE = 0.55
 
 @dataclass(frozen=True)
 class CentreLineSamples:
-    """Samples of a road's centre line every `SAMPLE_M` (m, rad), with a tree to search them."""
+    """Samples of a road's centre line about every 2 m: `s`, `x`, `y` in m and `heading` in rad,
+    each (n,), and a k-d tree of x, y to find the nearest sample."""
 
     s: FloatArray
     x: FloatArray
@@ -141,7 +142,9 @@ class Terrain:
 
 
 def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the height at column `u`, row `v` of the grid `z`, interpolated on drawn triangles."""
+    """Return the heights (m) at the columns `u` and rows `v`, which may be fractions, of the grid
+    `z` (rows, columns), m, interpolated on the drawn triangles. The result has the shape to which
+    `u` and `v` broadcast."""
     rows, columns = z.shape
     u, v = np.clip(u, 0.0, columns - 1.001), np.clip(v, 0.0, rows - 1.001)
     i, j = u.astype(np.intp), v.astype(np.intp)

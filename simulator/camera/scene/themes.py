@@ -1,5 +1,5 @@
-"""Scenery themes of the tracks: colours, hills, trees, objects beside the road. Values:
-themes.toml.
+"""Scenery themes of the tracks: colours, hills, trees, objects beside the road. themes.toml
+contains the values.
 
 Colours are linear RGB albedos; densities are numbers per 100 m of track.
 """
@@ -15,7 +15,8 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Theme:
-    """One scenery theme. Each scene varies its values at random, determined by the scene's seed."""
+    """One scenery theme. Each scene varies the theme's values at random, determined by the scene's
+    seed."""
 
     asphalt: Colour
     verge: Colour

@@ -22,8 +22,9 @@ LAMP_GLOW = 0.035
 
 
 def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
-    """Return `light` changed by `look`, on a road with this `albedo` (0: that of the scenery). Like
-    a camera's automatic exposure, the exposure compensates a part of the albedo."""
+    """Return `light` changed by `look`. Like a camera's automatic exposure, the exposure is
+    multiplied by (0.13 / `albedo`)^0.45, with the `albedo` of the road; if `albedo` is 0, the road
+    is as bright as the scenery defines it, and the exposure is not adapted."""
     automatic = (USUAL_ALBEDO / albedo) ** COMPENSATED if albedo else 1.0
     stops = look.exposure_stops
     if look.night:
@@ -34,7 +35,8 @@ def lit_as(light: Light, look: Lighting, albedo: float = 0.0) -> Light:
 
 
 def lamp_colour(look: Lighting) -> Colour:
-    """Return the light of a street lamp on the road below it; black if no lamps are lit."""
+    """Return the light, linear RGB, of a street lamp on the road directly below it; black if no
+    lamps are lit."""
     if not (look.night and look.lamp_every_m > 0.0):
         return 0.0, 0.0, 0.0
     red, green, blue = (
