@@ -1,5 +1,6 @@
-"""Paints the tree textures once per process: an atlas of square cells, one for each kind of tree,
-with sqrt-coded colour and alpha. Also computes the outlines of the trees.
+"""Paints the tree textures once per process into an atlas of square cells, one for each kind of
+tree. RGB is the square root of the linear colour; alpha is linear. The module also computes the
+outlines of the trees.
 
 Frame of an outline: x from -0.5 to 0.5, y from 0 (foot) to 1, as in tree.vert.glsl.
 """
@@ -32,7 +33,8 @@ Canvas = NDArray[np.float32]
 
 @cache
 def atlas() -> NDArray[np.uint8]:
-    """Paint the atlas (ROWS * CELL, COLUMNS * CELL, 4) uint8 RGBA; row 0 is the top row."""
+    """Paint the atlas (256, 512, 4) uint8 RGBA, 2 rows of 4 cells of 128 x 128 texels. Row 0 is the
+    top row."""
     rng = np.random.default_rng(77)
     painters = {
         "oak": _oak, "poplar": _poplar, "pine": _pine, "fir": _fir,
@@ -49,14 +51,16 @@ def atlas() -> NDArray[np.uint8]:
 
 
 def silhouettes() -> NDArray[np.uint8]:
-    """Return the alpha (kinds, CELL, CELL) uint8 of the trees; 255 is opaque."""
+    """Return the alpha (kinds, 128, 128) uint8 of the pictures of trees, in the order of KINDS; 255
+    is opaque."""
     alpha = atlas()[..., 3].reshape(ROWS, CELL, COLUMNS, CELL).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(alpha.reshape(-1, CELL, CELL))
 
 
 @cache
 def outlines() -> FloatArray:
-    """Return polygons (kinds, CORNERS, 2) round the pictures of the trees; see `outline`."""
+    """Return convex polygons (kinds, 6, 2) round the pictures of trees, in the order of KINDS and
+    in the frame of an outline."""
     return np.stack([outline(shape) for shape in silhouettes()])
 
 
@@ -192,8 +196,9 @@ def _birch(canvas: Canvas, rng: np.random.Generator) -> None:
 
 
 def outline(alpha: NDArray[np.uint8]) -> FloatArray:
-    """Return a convex polygon (CORNERS, 2) round the picture of `alpha` (size, size), in its
-    cell."""
+    """Return a convex polygon (6, 2) round the visible part of one cell, in the frame of an
+    outline. `alpha` (size, size) is the alpha of the cell. Equal corners at the end fill up a
+    polygon with fewer corners."""
     size = alpha.shape[0]
     spread = cv2.dilate((alpha > 0).astype(np.uint8), np.ones((2 * _BLEED + 1,) * 2, np.uint8))
     points = cv2.findNonZero(spread).reshape(-1, 2)

@@ -32,8 +32,9 @@ TUNNEL_STEP_M, TUNNEL_OVERHANG_M = 9.0, 4.5
 
 @dataclass(frozen=True)
 class Trees:
-    """N trees. `feet` (N, 3) m, world; `width` and `height` (N,) m; `cell` (N,) of the atlas;
-    `tint` (N, 3), factors on the colour; `s` and `offset` (N,) m, position beside the road."""
+    """N trees. `feet` (N, 3), m, world, are their positions on the ground, `width` and `height`
+    (N,) their sizes, m. `cell` (N,) is the index into `foliage.KINDS`, `tint` (N, 3) the factors on
+    the colour. `s` and `offset` (N,), m, are the positions along and beside the road."""
 
     feet: FloatArray
     width: FloatArray
@@ -55,8 +56,8 @@ def plant(
 ) -> Trees:
     """Select the trees of a scene. They stand in groves, denser near the road.
 
-    `avenue` adds a row of tall trees behind each wall line that meet over the road. `tunnel` makes
-    these rows denser, and the crowns close over the road.
+    `avenue` adds a row of tall trees behind the barriers on each side of the road; their crowns
+    reach over the asphalt. `tunnel` adds denser rows, whose crowns close over the road.
     """
     road = ground.road
     sites = [_groves(road, theme, rng)]

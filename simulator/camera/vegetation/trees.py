@@ -33,7 +33,7 @@ _OUTLINE_FAN = 4 + np.array([[0, k, k + 1] for k in range(1, CORNERS - 1)])
 @dataclass(frozen=True)
 class VisibleTrees:
     """Corner indices (n, 3) of the triangles of the visible trees, nearest tree first. The first
-    `near` triangles belong to near trees."""
+    `near` triangles belong to trees within 80 m of the eye."""
 
     corners: NDArray[np.uint32]
     near: int
@@ -75,7 +75,9 @@ class TreeMesh:
         }
 
     def visible(self, eye: FloatArray, planes: FloatArray, from_above: bool) -> VisibleTrees:
-        """Return the trees visible from `eye` (3,) within the side planes `planes` (4, 3)."""
+        """Return the visible trees, at most the 160 nearest within 420 m of `eye` (3,), m, world.
+        `planes` (4, 3) are the inward normals of the side planes. `from_above` is True for a view
+        straight down, in which the trees are drawn as crowns."""
         trees = visible_spheres(self._feet, self._size, REACH_M, MOST, eye, planes)
         squared = ((self._feet[trees] - eye) ** 2).sum(axis=1)
         near = int(np.searchsorted(squared, NEAR_M**2))
@@ -88,9 +90,9 @@ class TreeMesh:
         return VisibleTrees(corners.astype(np.uint32), near * len(fan))
 
     def draw(self, seen: VisibleTrees, part: Part) -> None:
-        """Draw one part of the visible trees: "core", the opaque part of near trees; "fringe",
-        blended over all else, the edges of near trees and far trees as a whole; "labels", all
-        trees."""
+        """Draw one part of the visible trees. "core" is the opaque part of near trees. "fringe" is
+        the edges of near trees and the whole of far trees, blended over everything drawn before.
+        "labels" is depth and class of all trees."""
         corners = seen.corners[: seen.near] if part == "core" else seen.corners
         if len(corners) == 0:
             return
