@@ -55,9 +55,9 @@ class _Worker:
 class PicturePool:
     """Draws pictures of `cars` cars in `workers` processes.
 
-    `formats` describes the picture of one car, by the name of its view. The first picture starts
-    the processes. An error, Ctrl-C or `close` ends the processes and frees their shared memory; the
-    next picture starts new processes.
+    `formats` contains shape and dtype of one car's picture of each view, by the view's name. The
+    first picture starts the processes. An error, Ctrl-C or `close` ends the processes and frees
+    their shared memory; the next picture starts new processes.
     """
 
     def __init__(
@@ -88,7 +88,8 @@ class PicturePool:
         return bool(self._workers) and self._owner == os.getpid()
 
     def number_of(self, scenery: Scenery) -> int:
-        """Return the number of `scenery` in a `Shot`. A scenery is sent to a worker only once."""
+        """Return the number by which a `Shot` refers to `scenery`. A scenery is sent to a worker
+        only once."""
         key = (id(scenery.road), scenery.light, scenery.light_seed)  # _sceneries keeps the id valid
         if key not in self._numbers:
             self._numbers[key] = len(self._sceneries)

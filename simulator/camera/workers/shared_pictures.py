@@ -25,7 +25,8 @@ class PictureFormat:
 
 
 def create_memory(cars: int, formats: dict[str, PictureFormat]) -> int:
-    """Create zeroed memory for the pictures of `cars` cars; the caller closes the descriptor."""
+    """Create zeroed memory for the pictures of `cars` cars. Returns its file descriptor, which the
+    caller must close."""
     descriptor = os.memfd_create("driverview-pictures")
     os.ftruncate(descriptor, sum(_size_bytes(cars, each) for each in formats.values()))
     return descriptor

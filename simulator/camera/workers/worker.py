@@ -68,7 +68,7 @@ class Task:
 
 
 class Cameras:
-    """The cameras of the sceneries drawn last, at most `most`, made by `build`."""
+    """Keeps the cameras of the `most` sceneries that were used last. `build` makes a camera."""
 
     def __init__(self, most: int, build: Callable[[Scenery], Camera]) -> None:
         self._most, self._build = most, build
