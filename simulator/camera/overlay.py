@@ -42,9 +42,10 @@ def marking_polylines(
     """Return pixel polylines (n, 2) along the centres of the true markings, leftmost first. Of a
     double line, the polyline follows the line nearer to the car's lane.
 
-    `at` is (s, body pose) of the car, or its state. Each polyline begins just behind the eye and
-    ends at `ahead_m`; points behind the camera or far outside the image are removed. Occlusion by
-    hills is ignored.
+    `at` is (s, body pose) of the car, or its state. The polylines reach from 2 m behind the car to
+    `ahead_m` ahead of it. In the views top, left and right they begin `ahead_m` behind the car; in
+    the rear view they reach from `ahead_m` behind the car to 2 m ahead. Points behind the camera or
+    far outside the image are removed. Occlusion by hills is ignored.
     """
     s, body_pose = at if isinstance(at, tuple) else (at.s, pose_of_state(at))
     # The rear view shows the road behind the car.
@@ -72,7 +73,8 @@ def draw(
     polylines: list[FloatArray],
     colour: tuple[int, int, int] = _COLOUR,
 ) -> NDArray[np.uint8]:
-    """Return a copy of `image` (H, W, 3) with the polylines drawn thin and antialiased."""
+    """Return a copy of `image` (H, W, 3) with the polylines, (n, 2) px each, drawn thin and
+    antialiased. `colour` is in the image's order of channels."""
     drawn = image.copy()
     # cv2 takes integer coordinates in 1/16 pixel.
     fixed = [np.rint(line * 16.0).astype(np.int32) for line in polylines]

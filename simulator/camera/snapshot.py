@@ -65,17 +65,17 @@ def write_contact_sheet(
     kind: str = COLOUR,
     camera: CameraParameters | None = None,
 ) -> None:
-    """Write a PNG of views at points all round `road`.
+    """Write a PNG of 16 views at points all round `road`.
 
-    All pictures show `view`; without it the sheet has driver views, one chase view and one top
-    view. All are in the light `light`; without it every second picture is in clear light and the
-    rest cycle through the other kinds. With `kind` "colour" the right half of each picture has the
-    true markings drawn thinly over the painted ones; "depth" and "class" are in false colours.
-    `camera` is the lens, scaled to WIDTH; without it, the driver camera is used, on a varied road
-    at the random camera height of that road. On a varied road each light has its own look. An
-    existing file is replaced only when the new one is complete. Raises UserError if `out` is not a
-    PNG file, its folder does not exist, or light, view or kind is unknown, and OSError if the file
-    cannot be written.
+    All pictures show `view`; None gives 14 driver views, one chase view and one top view. All
+    pictures are in the kind of light `light`; with None every second picture is in clear light and
+    the rest cycle through the other kinds. With `kind` "colour" the right half of each picture has
+    the true markings drawn thinly over the painted ones; "depth" and "class" are in false colours.
+    `traffic` is the number of cars ahead in each picture. `camera` is the lens, scaled to a width
+    of 480 px; None gives the driver camera. A road of `--roads varied` has another look in each
+    kind of light, and sets the height of the driver camera. An existing file is replaced only when
+    the new one is complete. Raises UserError if `out` is not a PNG file, its folder does not exist,
+    or light, view or kind is unknown, and OSError if the file cannot be written.
     """
     if out.suffix.lower() != ".png":
         raise UserError(f"{out}: the contact sheet is a PNG file; give a name that ends in .png")
@@ -119,7 +119,8 @@ def _lens(road: Road, camera: CameraParameters | None) -> CameraParameters:
 def render_shot(
     camera: Camera, road: Road, shot: Shot, traffic: int, rng: np.random.Generator
 ) -> Picture:
-    """Draw `shot` with a caption; a colour picture shows the true markings on its right half."""
+    """Draw `shot` with a caption and `traffic` cars ahead, random by `rng`; returns the picture
+    (H, W, 3) uint8 RGB. A colour picture shows the true markings on its right half."""
     pose = standing_pose(road, shot.s, shot.to_middle, shot.angle)
     cars = _cars_ahead(road, shot, traffic, rng)
     name = f"{shot.view}:{shot.kind}"
