@@ -44,7 +44,7 @@ class Cruise:
         self._speed_control.reset()
 
     def command(self, state: CarState, traffic: Traffic) -> Command:
-        """Return the command for one control step."""
+        """Return steering, throttle, brake and gear for one control step."""
         road = self._road
         if self._lane is None:
             self._lane = tf.lane_index(state.to_middle, road.lanes, road.lane_width)

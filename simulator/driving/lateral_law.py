@@ -26,7 +26,8 @@ class LateralLaw:
     def __init__(
         self, car: CarParameters, road: Road, *, natural_frequency: float, damping: float
     ) -> None:
-        """`natural_frequency` (rad/s) and `damping` ratio of the controlled lateral motion."""
+        """Set the gains such that the controlled lateral motion has the natural frequency
+        `natural_frequency` (rad/s) and the damping ratio `damping`."""
         self._car = car
         self._track = road.track
         self._rear_stiffness = car.cornering_stiffness(False, SURFACES[road.track.surface].grip)
@@ -34,7 +35,8 @@ class LateralLaw:
         self._damping = damping
 
     def road_curvature(self, state: CarState) -> float:
-        """Return the curvature (1/m) of the car's path parallel to the road, `PREVIEW_S` ahead."""
+        """Return the curvature (1/m) of a path through the car that stays parallel to the road, at
+        the point that the car reaches after 0.12 s."""
         curvature = self._track.curvature(state.s + feedback_speed(state) * PREVIEW_S)
         return float(curvature / max(1.0 - curvature * state.to_middle, MIN_RADIUS_FACTOR))
 
@@ -69,5 +71,6 @@ class LateralLaw:
 
 
 def feedback_speed(state: CarState) -> float:
-    """Return the speed (m/s), at least MIN_SPEED, for which gains and preview are computed."""
+    """Return the speed (m/s) for which gains and preview are computed: the car's speed, at least 5
+    m/s."""
     return max(state.speed, MIN_SPEED)

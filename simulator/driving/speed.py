@@ -1,8 +1,5 @@
-"""Computes the speed of the scripted drivers: a speed profile of the track, and throttle, brake,
-gear.
-
-SI units.
-"""
+"""Speed control of the scripted drivers. It computes a speed profile of the track, and the
+throttle, brake and gear with which a car follows the profile. SI units."""
 
 from dataclasses import dataclass
 from math import inf
@@ -29,8 +26,8 @@ INTEGRAL_LIMIT = 1.0  # m/s2
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Speed limits (m/s) of cells along the lap, from the bends and the braking distance before
-    them."""
+    """Speed limits `limit` (cells,), m/s, of cells of `cell_m` (m) along the lap. They allow for
+    the bends and for the braking distance before each bend."""
 
     limit: NDArray[np.float64]
     cell_m: float
@@ -48,8 +45,8 @@ def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProf
 
 
 def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
-    """Compute a profile that is limited only by bends and braking before them. `innermost_y` (m) as
-    in `speed_profile`."""
+    """Compute a profile that is limited only by bends and by braking before them. `innermost_y` (m)
+    is the largest offset to the inside of the centre line at which bends are driven."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)
@@ -156,7 +153,8 @@ class TargetSpeed:
 
 
 class SpeedControl:
-    """Applies `TargetSpeed` to a speed profile of the track."""
+    """Computes throttle, brake and gear that follow a speed profile of the track and keep the
+    distance to a leader."""
 
     def __init__(
         self, profile: SpeedProfile, track: Track, car: CarParameters, step_s: float
@@ -170,15 +168,15 @@ class SpeedControl:
         self._follower.reset()
 
     def command(self, state: CarState, traffic: Traffic) -> tuple[float, float, int]:
-        """Return throttle, brake and gear for one control step."""
+        """Return throttle, brake (0 to 1) and gear for one control step."""
         target = self._profile.at(state.s + PREVIEW_S * max(state.speed, 0.0))
         slope = float(self._track.slope(state.s))
         return self._follower.command(state, traffic, target, slope)
 
 
 def target_acceleration(speed: float, target: float, follow: float = inf) -> float:
-    """Return a comfortable acceleration (m/s2) from `speed` towards `target` (m/s), at most
-    `follow`.
+    """Return the acceleration (m/s2) with which a comfortable driver changes `speed` to `target`
+    (both m/s): from -4 to 2 m/s2, or `follow` if that is lower.
 
     `follow` (m/s2) is the acceleration that the distance to the car ahead allows.
     """
