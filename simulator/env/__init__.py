@@ -46,8 +46,9 @@ RENDERING = {"render_modes": ["rgb_array"], "render_fps": 20}
 class LateralControl(gym.Env[Any, Any]):
     """Keep the car in the middle of the track: an environment that observes the car's state.
 
-    Observation (7,) float32: to_middle/w, angle/pi, v_x and v_y divided by 75 km/h, class of the
-    road one-hot (left, straight, right). Action: steering in [-1, 1], left positive.
+    The observation (7,) float32 is to_middle divided by half of the track's width, angle / pi, v_x
+    and v_y divided by 75 km/h, and the class of the road one-hot (left, straight, right). The
+    action is the steering in [-1, 1], left positive.
 
     Keyword arguments are the fields of DriveOptions, EpisodeOptions, ObservationOptions and
     RenderOptions, and `render_mode` ("rgb_array" or None). Raises UserError for options or actions

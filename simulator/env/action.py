@@ -63,8 +63,10 @@ def to_command(action: Any, controls: Controls) -> Command:
 
 
 def to_rows(actions: Any, controls: Controls, moving: NDArray[np.bool_]) -> FloatArray:
-    """Convert `actions` (N, k) to rows of steer, throttle, brake and gear (N, 4), as `to_command`
-    does. Checks only the cars that are `moving` (N,). Raises UserError, which names the car."""
+    """Convert `actions` (N, 1) or (N, 4) to rows of steer, throttle, brake and gear (N, 4); the
+    gear is rounded. For (N, 1), throttle is 0.2, brake 0 and gear 1. Only the cars that are
+    `moving` (N,) are checked: values beyond their bounds by no more than float32 rounding are
+    clipped, values farther outside raise a UserError that names the car."""
     names = NAMES[controls]
     values = _numbers("actions", actions)
     if values.shape != (len(moving), len(names)):

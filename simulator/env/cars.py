@@ -39,9 +39,9 @@ FEATURES = (*MARKINGS, "to_lane_centre")
 class Cars:
     """One car for each entry of `options`, and the outputs of the cars' last control step.
 
-    noise: standard deviation of the noise on the states; limit: bound of the states; beams: whether
-    the range beams are computed; threads: number of threads that step the cars. The outputs do not
-    depend on the number of cars or threads.
+    `noise` is the standard deviation of the noise on the state vectors, and `limit` the bound to
+    which their values are clipped. `beams` is whether the range beams are computed. At most
+    `threads` threads step the cars. The outputs do not depend on the number of cars or threads.
     """
 
     def __init__(
@@ -97,8 +97,9 @@ class Cars:
         rngs: Sequence[np.random.Generator],
         moving: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Advance the cars that are `moving` (N,), by default all, by one control step with the
-        commands in their rows of the fleet."""
+        """Advance the cars that are `moving` (N,), by default all, by one control step. The row of
+        each car in `fleet.cars` contains the command. `rngs` contains the generator of each car's
+        noise."""
         moving = self._everyone if moving is None else moving
         rows = self.fleet.cars
         rows[:, TOUCHED], rows[:, DONE], rows[:, SKIPPED] = 0.0, 0.0, ~moving
@@ -126,8 +127,7 @@ class Cars:
         return ENDINGS[code - 1] if code else None
 
     def features(self, number: int) -> dict[str, float]:
-        """Return a car's present features by name; Gymnasium requires that absent ones be
-        omitted."""
+        """Return a car's features by name. Absent features have no entry, as Gymnasium requires."""
         row = self.results[number].tolist()
         found = dict(zip(FEATURES, row[DISTANCES_AT : TO_LANE_CENTRE + 1], strict=True))
         present = {name: value for name, value in found.items() if value == value}

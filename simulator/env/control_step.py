@@ -75,7 +75,8 @@ def step_cars(
     begin: int, end: int, fleet: Arrays, steps: int, outputs: Outputs, rules: Rules
 ) -> None:
     """Advance the cars `begin` to `end` - 1 by one control step of `steps` physics steps, and fill
-    the outputs of the cars that completed it."""
+    their outputs. A car that touches something stops before the end of the step, and its outputs
+    are not filled; `Cars.step` completes its control step."""
     work, lent, filled = make_work(), lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         if advance_car(number, lent, steps, lend_work(work)):
@@ -95,14 +96,16 @@ def observe_cars(
 
 @compiled
 def lend_outputs(outputs: Outputs) -> Outputs:
-    """Return the same arrays without reference counting (`runtime.jit.borrowed`)."""
+    """Return the arrays `outputs`, which compiled code then uses without reference counting.
+    Counting would take longer than the arithmetic (see `runtime.jit.borrowed`)."""
     states, results, beams, noise = outputs
     return borrowed(states), borrowed(results), borrowed(beams), borrowed(noise)
 
 
 @compiled
 def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool) -> None:
-    """Fill the outputs of car `number`; `first` as in `observe_cars`."""
+    """Fill the outputs of car `number`. `first` is True at the start of an episode, when reward,
+    score and ending are 0."""
     states, results, beams, noise = outputs
     ends, rewarded, weight, limit, angles = rules
     car, result = fleet[0][number], results[number]
@@ -135,7 +138,9 @@ def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, firs
 
 @compiled
 def ending_of(car: FloatArray, road: FloatArray, ends: int) -> int:
-    """Return the `ending_code` for a car, from its row and the row of its road in the fleet."""
+    """Return 1 + the index into ENDINGS of the event that ends the episode of a car; 0 if it
+    continues. `car` and `road` are the rows of the car and of its road in the fleet, `ends` is the
+    `ends_code` of the events that end an episode."""
     track = car[TRACK_AT:]
     return ending_code(
         abs(track[TRACK_OFFSET]) > road[EDGE],

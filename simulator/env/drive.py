@@ -28,7 +28,8 @@ class RoadShop:
         self._roads: dict[tuple[Any, ...], Road] = {}
 
     def road(self, options: DriveOptions, track: str, lanes: int, width: float | None) -> Road:
-        """Return the road of `width` m with `lanes` lanes on `track`, built at its first use."""
+        """Return the road with `lanes` lanes of `width` (m) on `track`, built at its first use.
+        None for `width` is 4.0 m, or the random width of a road of `--roads varied`."""
         place = (track, options.tracks_dir)
         if place not in self._tracks:
             folder = None if options.tracks_dir is None else Path(options.tracks_dir)
@@ -69,9 +70,10 @@ class Drive:
         return episode
 
     def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the start of an episode with the `given` options of `reset`; ranges are not
-        resolved yet. Raises UserError for an unknown option, a value that is no number, or a start
-        off the road. If the episode's road is random, the start is not checked against it."""
+        """Return the start of an episode: the start in the car's own options, overridden by the
+        options `given` to `reset`. Ranges stay ranges. Raises UserError for an unknown option, a
+        value that is not a number, or a start off the road. The last check is left out if the
+        episode's road is random."""
         start = {**self._options.start, **given}
         ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
         for end in (0, 1):

@@ -67,17 +67,18 @@ class ObservationOptions:
 
     @property
     def state_noise(self) -> float:
-        """Standard deviation of the noise on the state, as a number."""
+        """Standard deviation of the noise on the state; 0.05 if the option `noise` is True."""
         return PAPER_STATE_NOISE if self.noise is True else float(self.noise)
 
     @property
     def limit(self) -> float:
-        """Bound of the state, increased by ten standard deviations of the noise."""
+        """Bound of the absolute values of the state: 10, plus ten standard deviations of the
+        noise."""
         return STATE_LIMIT * (1.0 + self.state_noise)
 
     def resolved(self, kind: Kind) -> "ObservationOptions":
-        """Return a copy in which `observation` and `views` are set for an environment of this
-        `kind`.
+        """Return a copy in which `observation` and `views` are not None. None is replaced by the
+        value that the remaining options and the `kind` of the environment imply.
 
         Raises UserError for options that contradict each other.
         """
@@ -108,7 +109,8 @@ class Renderer(Protocol):
 
 
 class Observer:
-    """Builds the observations of one car; `options` must be resolved.
+    """Builds the observations of one car; `options` must be the result of
+    `ObservationOptions.resolved`.
 
     `beams` (19,) are the distances (m) of the range meter in the current state. With None they are
     computed when the sensor is read.
@@ -189,7 +191,8 @@ class Observer:
 
 
 def read_from_beams(sensor: str | Sensor) -> bool:
-    """Return whether a sensor is the range meter; the control step computes its beams."""
+    """Return whether `sensor` is a range meter. An environment reads range meters from the beams
+    that the control step computes."""
     return sensor != CAMERA and sensors_of([sensor])[0].read is read_track_range
 
 

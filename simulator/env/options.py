@@ -86,8 +86,8 @@ class DriveOptions:
             ends_of(name, setting)
 
     def car(self, rng: np.random.Generator | None) -> CarParameters:
-        """Return the car of an episode. Values of ranges are random numbers from `rng`; without
-        `rng` they are the least values."""
+        """Return the car of an episode. Where `friction` or `mass` is a range, the value is a
+        random number from `rng`, or the least value if `rng` is None."""
         friction, mass = draw(self.friction, rng), draw(self.mass, rng)
         car = CarParameters()
         if friction == mass == 1.0:

@@ -128,8 +128,8 @@ class EpisodeOptions:
             )
 
     def compute_reward(self, state: CarState, road: Road, ended: Ending | None) -> float:
-        """Return the `reward` of a step that led to `state`. Raises UserError unless it is
-        finite."""
+        """Return the number that the user's function `reward`, which must not be None, gives for a
+        step that led to `state`. Raises UserError unless the number is finite."""
         assert self.reward is not None
         reward = float(self.reward(state, road, ended))
         if not math.isfinite(reward):

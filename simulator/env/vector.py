@@ -5,8 +5,8 @@
         track="random", friction=(0.8, 1.2), start={"s": (0.0, 1000.0)},
     )
 
-Each car gives the same numbers, bit for bit, as a single environment with its options and seed.
-Worker processes draw the pictures.
+Each car gives the same numbers, bit for bit, as a single environment with the same options and
+seed. Worker processes draw the pictures.
 """
 
 import os
@@ -55,12 +55,13 @@ Options = TypeVar("Options", DriveOptions, RenderOptions)
 class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     """`num_envs` cars; each behaves like the car of one `LateralControl`.
 
-    The options are those of `LateralControl`. Each option of PER_CAR, and each entry of `start`, is
-    one value for all cars or a list with one value for each car. A tuple (least, greatest) is a
-    range from which each episode draws a number. `threads`: largest number of threads that step the
-    cars; None: one per core, with at least 32 cars per thread. `workers`: number of processes that
-    draw pictures, if there are any; None: one per core. copy=False: the pictures of an observation
-    are arrays in the memory shared with the workers; the next `step` or `reset` overwrites them.
+    The options are those of `LateralControl`. The options for road, traffic, friction, mass, start
+    and light (PER_CAR), and each entry of `start`, are one value for all cars or a list with one
+    value for each car. A tuple (least, greatest) is a range from which each episode draws a number.
+    At most `threads` threads step the cars; None gives one per core, with at least 32 cars per
+    thread. `workers` processes draw the pictures, if there are any; None gives one per core. If
+    `copy` is False, the pictures of an observation are arrays in the memory shared with the
+    workers, and the next `step` or `reset` overwrites them.
 
     Raises UserError, which names the car, for bad options and actions; then no car has moved.
     Raises PictureWorkerError if a worker dies; `reset` starts new workers.
@@ -143,8 +144,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode of each car, or of the cars in the mask `options["reset_mask"]` (N,)
-        bool. The other options are those of a single environment; each is a number, a list with one
-        value for each car, or a range (least, greatest)."""
+        bool; returns the observations and infos of all cars. The options "s", "to_middle", "angle"
+        and "speed" are a number, a list with one value for each car, or a range
+        (least, greatest)."""
         if self.closed:
             raise UserError("this environment is closed; make a new one")
         given = reset_options(options)
@@ -165,8 +167,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     def step(
         self, actions: Any
     ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Advance all cars by one control step. Cars whose episode has ended are reset according to
-        the autoreset mode."""
+        """Advance all cars by one control step with `actions` (N, 1) or (N, 4). Cars whose episode
+        has ended are reset according to the autoreset mode. Returns observations, rewards (N,),
+        terminated (N,), truncated (N,) and info."""
         self._check_running()
         moving = ~self._over
         rows = to_rows(actions, self._controls, moving)

@@ -21,8 +21,8 @@ _ENDINGS = np.array(["", *ENDINGS], object)
 
 def vector_info(cars: Cars, frequency_hz: int, chosen: NDArray[np.bool_]) -> dict[str, Any]:
     """Return an array (N,) for each entry of a car's `info`. For each entry, a boolean array (N,)
-    under the entry's name with a leading underscore marks the cars that have it: the `chosen` cars
-    (N,)."""
+    under the entry's name with a leading underscore marks the cars whose value is valid: the
+    `chosen` cars (N,), except where a feature is absent."""
     rows, results = cars.fleet.cars, cars.results
     track = rows[:, TRACK_AT:]
     steps = rows[:, STEPS].astype(int)

@@ -15,10 +15,11 @@ from simulator.sensors.standard import CAMERA
 
 
 class VectorObserver:
-    """Builds the observations of `cars`. `options` must be resolved; `pictures` are the options of
-    each car's pictures, which `workers` processes draw.
+    """Builds the observations of `cars`. `options` must be the result of
+    `ObservationOptions.resolved`. `pictures` contains the picture options of each car; `workers`
+    processes draw the pictures.
 
-    render_view: an additional view that `frames` returns, or None. copy: whether pictures are
+    `render_view` is an additional view that `frames` returns, or None. If `copy`, pictures are
     copied out of the shared memory, so that the next step does not change them.
     """
 
@@ -54,11 +55,13 @@ class VectorObserver:
         }
 
     def restart(self, number: int, episode: int) -> None:
-        """Seed the noise of a car's sensors for an episode."""
+        """Seed the noise of the sensors of car `number` with `episode`, the seed of the episode."""
         self._observers[number].restart(episode)
 
     def observe(self, chosen: NDArray[np.bool_]) -> Any:
-        """Observe the `chosen` cars (N,) anew; returns the observations of all cars."""
+        """Return the observations of all cars. The pictures are drawn and the sensors are read only
+        for the `chosen` cars (N,); for the remaining cars they are as they were at the last
+        call."""
         kind: Kind | None = self._first.kind
         if kind == "state":
             return self._cars.states.copy()
@@ -71,7 +74,7 @@ class VectorObserver:
         return {STATE: self._cars.states.copy()} | views | self._read_sensors(numbers)
 
     def frames(self) -> tuple[NDArray[np.uint8], ...]:
-        """Return the picture of the render view of each car."""
+        """Return the picture (H, W, 3) of the view `render_view` of each car."""
         view = str(self._render_view)
         self._pictures.draw((view,), range(len(self._observers)))
         return tuple(self._pictures.of(view).copy())

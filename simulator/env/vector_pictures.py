@@ -89,7 +89,8 @@ class CarPictures:
 
 
 def checked_workers(workers: Any, cars: int) -> int:
-    """Return the number of processes for the option `workers`; None means one per core."""
+    """Return the number of processes for the option `workers`, at most `cars`. None means one per
+    core."""
     if workers is None:
         workers = len(os.sched_getaffinity(0))
     return min(check_whole("workers", workers, 1), cars)

@@ -1,5 +1,5 @@
-"""Renders the views of an environment with one camera, built at first use; each view at most once
-per step."""
+"""Renders the views of an environment, each at most once per step, with one camera that is built at
+first use."""
 
 import weakref
 from collections.abc import Sequence
