@@ -20,7 +20,8 @@ MAX_STEPS = 6500
 
 
 def register_environments() -> None:
-    """Register both environments with Gymnasium, unless they are registered already."""
+    """Register `driverview/LateralControl-v0` and `driverview/DriverView-v0` with Gymnasium, unless
+    they are registered already."""
     import gymnasium
 
     for name, entry_point in ENVIRONMENTS.items():

@@ -1,5 +1,5 @@
-"""The shared-memory link: a server process runs the simulator, a client in any language drives the
-car.
+"""The shared-memory link between a server process, which runs the simulator, and a client, which
+drives the car. A client can be written in any language.
 
     simulator link --track forza --name /driverview      starts the server
     simulator.link.client.Link                           a client in Python

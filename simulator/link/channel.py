@@ -1,7 +1,8 @@
-"""The two directions of a link. A sender writes a block of the shared memory, a receiver reads it.
+"""Sends and receives the messages of a link. A message is one block of the shared memory (COMMAND
+from the client, STATE from the server, see `layout`), and for STATE the camera image.
 
-The user of a sender fills `record` (and `image`) and calls `send`. A receiver's `record` and
-`image` contain the newest complete message.
+To send a message, fill the sender's `record` (and `image`, bytes (n,)) and call `send`. After a
+`poll` or `wait` that returns True, the receiver's `record` and `image` contain the newest message.
 """
 
 from typing import Any
@@ -36,7 +37,8 @@ class _MessageBuffer:
 
 
 class Sender:
-    """Writes messages to `block`; it must be the block's only writer."""
+    """Writes messages to the block `block` of the segment. No other sender may write to this
+    block."""
 
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
         self._buffer = _MessageBuffer(segment, block, image_bytes)
@@ -61,17 +63,19 @@ class Receiver:
         self.record, self.image = self._buffer.record, self._buffer.image
 
     def poll(self) -> bool:
-        """Copy a newer message into `record`, if there is one; returns whether there was one.
+        """Copy the newest message into `record` and `image`, unless it was received before. Returns
+        whether a message was copied.
 
-        `damaged` is True if its checksum is wrong, that is, if the writer violates the protocol.
+        Sets `damaged` to True if the message has a wrong checksum, that is, if its writer violates
+        the protocol. The contents of `record` are then undefined.
         """
         outcome, self._seen = try_read(*self._buffer.arrays, self._seen)
         self.damaged = outcome == DAMAGED
         return bool(outcome != NOTHING)
 
     def wait(self, seconds: float) -> bool:
-        """Poll, but wait about `seconds` for a message if there is none: spin briefly, then
-        sleep."""
+        """Wait at most about `seconds` for a new message and receive it as `poll` does. Returns
+        whether one arrived. The function spins for about 20 us, then sleeps."""
         current = int(spin_until_new(self._buffer.sequence, self._seen, SPIN_COUNT))
         if current == self._seen or current & 1:
             futex.wait(self._buffer.address, current, seconds)

@@ -40,9 +40,10 @@ class Link:
     """A client connected to one server. `wait_s` is the time to wait for a server that does not
     exist yet, `timeout_s` the time to wait for each answer.
 
-    Every call raises ServerDied soon after the server's end, LinkTimeout if no answer arrives in
-    time, and Refused if the server refuses the request. The constructor raises NoServer, NameInUse
-    and LayoutMismatch.
+    `reset`, `step` and `quit` raise ServerDied if the server has ended, LinkTimeout if no answer
+    arrives within `timeout_s`; `reset` and `step` raise Refused if the server refuses the request.
+    The constructor raises NoServer if no server exists after `wait_s`, NameInUse if the server has
+    another client, and LayoutMismatch if the server uses another memory layout.
     """
 
     def __init__(
@@ -69,8 +70,9 @@ class Link:
         angle: float = 0.0,
         speed: float = 0.0,
     ) -> Message:
-        """Start an episode and return its first message; the arguments are those of `World.reset`.
-        Without `seed` the server chooses one."""
+        """Start an episode and return its first message. `s` (m along the centre line) defaults to
+        25 m before the line; `to_middle` is in m, left positive, `angle` (track tangent minus yaw)
+        in rad, `speed` in m/s. Without `seed` the server chooses a seed."""
         record = self._outbox.record
         record["request"] = Request.RESET
         record["seed"] = -1 if seed is None else seed
@@ -80,13 +82,14 @@ class Link:
         return self._request()
 
     def step(self, command: Command) -> Message:
-        """Apply `command` for one control step and return the message after it. In real time, the
-        command is applied from the next step on."""
+        """Apply `command` for one control step and return the message with the state after this
+        step. A server in real-time mode applies the command from its next step on."""
         write_command(self._outbox.record, command)
         return self._request()
 
     def latest(self) -> Message:
-        """Return the newest message without a request, for observers in real time."""
+        """Return the newest message of the server without sending a request, to observe a server in
+        real-time mode. Raises LinkError if the server has sent no message yet."""
         self._check_open()
         self._receive()
         return self._message()
@@ -99,7 +102,8 @@ class Link:
         self._segment.close()
 
     def close(self) -> None:
-        """Disconnect; the server waits for its next client."""
+        """Disconnect. The server then waits for its next client, or ends if it runs with
+        `--once`."""
         if self._closed:
             return
         try:

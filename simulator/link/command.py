@@ -27,10 +27,11 @@ Header = Annotated[
 def link(
     config: LinkConfig, camera: CameraSize = "none", header: Header = None, as_json: AsJson = False
 ) -> None:
-    """Run the simulator for a client in another process: C, Python, any language.
+    """Run the simulator for a client in another process, written in C, Python or any other
+    language.
 
-    A client sends a reset, then one command per control step; see driverview_link.h. Ctrl-C,
-    SIGTERM or a client's QUIT request ends it.
+    A client sends a reset, then one command per control step (see driverview_link.h). Ctrl-C,
+    SIGTERM or a client's QUIT request ends the server.
     """
     if header is not None:
         _write_header(header)

@@ -8,11 +8,11 @@ class LinkError(UserError):
 
 
 class NoServer(LinkError):
-    """Raised if there is no server of this name (yet)."""
+    """Raised if no server of this name is running."""
 
 
 class NameInUse(LinkError):
-    """Raised if another process has this name, or has this role on the link."""
+    """Raised if a server of this name is running already, or if the server has a client already."""
 
 
 class LayoutMismatch(LinkError):
@@ -20,11 +20,12 @@ class LayoutMismatch(LinkError):
 
 
 class ServerDied(LinkError):
-    """Raised if the server's process has ended or it has closed the link."""
+    """Raised if the server's process has ended, or if the server has closed the link."""
 
 
 class ClientLost(LinkError):
-    """Raised if the server's client has died, or has sent nothing for too long."""
+    """Raised if the server's client has died, or has sent nothing for longer than `--patience`
+    seconds."""
 
 
 class DamagedMessage(LinkError):
@@ -38,7 +39,7 @@ class LinkTimeout(LinkError):
 class Refused(LinkError):
     """Raised if the server has refused a command; the state of the car is unchanged.
 
-    `code` is one of `layout.Refusal`.
+    `code` is the value of a `layout.Refusal`.
     """
 
     def __init__(self, code: int, text: str) -> None:

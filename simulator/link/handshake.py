@@ -15,7 +15,8 @@ from simulator.link.sync.seqlock import get_word, set_word
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """The constant properties of a server; units as in the layout's HEADER."""
+    """The properties of a server that do not change while it runs. Lengths in m, `steering_lock`
+    and `beam_angles` (19,) in rad, image size in px, `engine_pid` is the server's process id."""
 
     track: str
     lanes: int
@@ -34,7 +35,7 @@ class ServerInfo:
 
 
 def write_header(segment: Segment, info: ServerInfo) -> None:
-    """Write the header into a segment that is not published yet."""
+    """Write the header into a new segment, before `Segment.publish` makes it visible to clients."""
     record = _record(segment)
     record["magic"] = MAGIC
     record["byte_order"] = layout.BYTE_ORDER
@@ -49,7 +50,8 @@ def write_header(segment: Segment, info: ServerInfo) -> None:
 
 
 def read_header(segment: Segment) -> ServerInfo:
-    """Return the server's properties. Raises LayoutMismatch."""
+    """Return the server's properties. Raises LayoutMismatch if the server uses another memory
+    layout."""
     check_identity(segment)
     record = _record(segment)
     values = {field.name: record[field.name].item() for field in fields(ServerInfo)[1:-1]}
@@ -96,7 +98,8 @@ def phase(segment: Segment) -> Phase:
 
 
 def set_phase(segment: Segment, value: Phase) -> None:
-    """Store the phase. Who reads the new phase also sees everything written before it."""
+    """Store in the header whether the server is running. A client that reads the new value also
+    sees everything that was written before it."""
     set_word(_phase_word(segment), int(value))
 
 

@@ -1,4 +1,5 @@
-"""Generates the link's C header: tables of the layout between the fixed parts in the folder c/."""
+"""Generates the link's C header. It consists of the hand-written parts in the folder c/ and of
+constants, enumerations and structs generated from `layout`."""
 
 from enum import IntEnum
 from importlib.resources import files

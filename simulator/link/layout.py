@@ -1,9 +1,9 @@
-"""The layout of the link's shared memory. layout.toml contains its only definition.
+"""The layout of the link's shared memory, which the tables in layout.toml define.
 
 The memory consists of three blocks and the camera image: HEADER (the server writes it once),
-COMMAND (the client writes it) and STATE (the server writes it). Byte order is that of the machine.
-`simulator link --header FILE` generates a C header from the tables. A change of the tables must
-increase VERSION; the layout hash detects a forgotten increase.
+COMMAND (the client writes it) and STATE (the server writes it). All values have the machine's byte
+order. `simulator link --header FILE` generates a C header from the tables. A change of the tables
+must increase VERSION. If VERSION was not increased, the layout hash still detects the change.
 """
 
 import hashlib
@@ -90,7 +90,8 @@ C_TYPES: Final = {
 
 @dataclass(frozen=True)
 class Field:
-    """One named value, or an array of `count` values; `kind` is a key of C_TYPES."""
+    """One field of a block: a single value, or an array of `count` values. `kind` is a key of
+    C_TYPES, which contains the C type; `char` stands for a text of `count` bytes."""
 
     name: str
     kind: str
@@ -150,8 +151,8 @@ ERROR_BYTES: Final = STATE.places["error_text"][1]
 
 
 def image_bytes(width: int, height: int) -> int:
-    """Return the size in bytes of the image area: RGB, rows from the top, rounded up to whole
-    words."""
+    """Return the size in bytes of the memory of an RGB image of `width` x `height` px, rounded up
+    to a multiple of 8. The rows are stored from the top."""
     return -(-width * height * 3 // MESSAGE_ALIGNMENT) * MESSAGE_ALIGNMENT
 
 
@@ -160,7 +161,7 @@ def segment_size(width: int, height: int) -> int:
 
 
 def layout_hash() -> int:
-    """Return a hash of 64 bits of all names, types, counts, offsets and enumerations."""
+    """Return a 64-bit hash of all field names, types, counts, block offsets and enumerations."""
     parts = [f"{block.name}@{block.offset}" for block in BLOCKS]
     parts += [f"{f.name}:{f.kind}x{f.count}" for block in BLOCKS for f in block.fields]
     parts += [f"{kind.__name__}.{m.name}={m.value}" for kind in ENUMS for m in kind]

@@ -1,4 +1,5 @@
-"""Converts between records of the shared memory and Python objects."""
+"""Converts between records of the shared memory and Python objects. A record is a numpy row with
+the fields of the block STATE or COMMAND of `layout`; `Values` are its fields by name."""
 
 import math
 from dataclasses import dataclass, fields
@@ -91,7 +92,8 @@ def read_ending(values: Values) -> Ending | None:
 
 
 def read_message(record: Any, image: NDArray[np.uint8] | None) -> Message:
-    """Return the message in `record` with its `image`; both are copied."""
+    """Return the message in the STATE record `record`, with its `image` (H, W, 3); both are
+    copied."""
     # One tolist() reads all fields; reading each field separately takes ten times as long.
     values: Values = dict(zip(record.dtype.names, record.tolist(), strict=True))
     return Message(

@@ -1,4 +1,5 @@
-"""Runs a link server with the given options: builds the world, warms it up, and serves."""
+"""Runs a link server with the given options: builds the world, compiles its functions, and
+serves."""
 
 import os
 import signal
@@ -30,9 +31,10 @@ if TYPE_CHECKING:
 
 def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
     """Serve until a client sends QUIT, or until SIGINT or SIGTERM; `report` receives log lines.
-    Returns the server's counts.
+    Returns the numbers of clients, episodes, steps and refused commands.
 
-    Raises UserError for bad options, and ClientLost in the same cases as `LinkServer.serve`.
+    Raises UserError for bad options, and ClientLost if a client sends nothing for `patience_s`, or
+    if a client dies and `once` is set.
     """
     futex.check_system()
     if not config.patience_s >= 0.0:  # NaN too

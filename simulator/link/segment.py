@@ -36,7 +36,8 @@ FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, pid
 
 
 class Role(IntEnum):
-    """The roles; the value is the byte of the segment that the role locks."""
+    """The role of a process in a segment. Its value is the index of the byte that the role
+    locks."""
 
     SERVER = 0
     CLIENT = 1
@@ -56,13 +57,15 @@ class Segment:
         return np.frombuffer(self.memory, dtype=np.uint8)
 
     def peer_is_alive(self) -> bool:
-        """Return whether a process holds the other role, that is, whether the peer is alive."""
+        """Return whether the peer (the client for a server, the server for a client) is alive."""
         return is_locked(self.descriptor, Role(1 - self.role))
 
     def publish(self) -> None:
-        """Give a new, complete segment its name; replace the segment of a dead server.
+        """Make a new, complete segment visible to clients under its name; replace the segment of a
+        dead server.
 
-        Raises NameInUse and LinkError; see `remove_stale`.
+        Raises NameInUse if a server of this name is running, and LinkError if the name belongs to
+        another program or user.
         """
         folder = os.open(SHM, os.O_RDONLY)
         try:
@@ -105,7 +108,7 @@ os.register_at_fork(after_in_child=_close_in_child)
 
 def check_name(name: str) -> str:
     """Return `name`. Raises LinkError unless it is a valid name of shared memory on every system: a
-    slash and a plain name."""
+    slash, then at least one character, no further slash, and at most 250 bytes."""
     if not name.startswith("/") or len(name) < 2:
         raise LinkError(f"the link's name is {name!r}; it begins with a slash: /driverview")
     if "/" in name[1:] or "\0" in name or name in ("/.", "/.."):

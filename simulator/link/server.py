@@ -46,11 +46,13 @@ class Summary:
 
 
 class LinkServer:
-    """Serves one link. `make_simulation(record, image)` builds the Simulation that fills both.
+    """Serves one link. `make_simulation(record, image)` builds the Simulation, which writes its
+    answers to the STATE record `record` and to the image bytes `image`.
 
-    `once`: end when the first client leaves. `patience_s`: longest silence of a running client;
-    after it the server ends (0: no limit). `report` receives log lines. Raises NameInUse and
-    LinkError; see `segment`.
+    If `once` is True, the server ends when the first client leaves. The server also ends if a
+    connected client sends nothing for `patience_s` (0: no limit). `report` receives log lines.
+    Raises NameInUse if a server of this name is running, and LinkError if there is not enough
+    shared memory.
     """
 
     def __init__(
@@ -80,11 +82,11 @@ class LinkServer:
         self._segment.publish()
 
     def serve(self, interrupted: Callable[[], bool] = lambda: False) -> None:
-        """Answer requests until a client sends QUIT or, with `once`, leaves, or until
-        `interrupted()`.
+        """Answer requests until a client sends QUIT, until `interrupted()` returns True, or, if
+        `once` is set, until the first client leaves.
 
-        Raises ClientLost if a client dies with `once`, or if a client sends nothing for
-        `patience_s`.
+        Raises ClientLost if a client sends nothing for `patience_s`, or if a client dies and `once`
+        is set.
         """
         while not (self._done or interrupted()):
             if self._wait_for_command():

@@ -27,10 +27,10 @@ _NOT_OPEN = "there is no episode yet; ask for a reset first"
 
 
 class Simulation:
-    """One world behind a link. `record` is a row of the layout's STATE, `image` the buffer for its
-    image.
+    """Answers the requests to one world. `record` is the STATE record for the answers, `image` (n,)
+    uint8 the memory for the camera image.
 
-    A reset without a seed starts episode n with the seed `seed` + n.
+    The n-th episode (n from 1) has the seed `seed` + n if its reset request gives no seed.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Simulation:
         self._open, self._why_closed = False, _NOT_OPEN
 
     def answer(self, request: Any) -> None:
-        """Execute `request`, a row of the layout's COMMAND, and fill the record."""
+        """Execute the COMMAND record `request` and write the answer into the STATE record."""
         record = self._record
         record["error"], record["error_text"] = Refusal.NONE, b""
         asked = int(request["request"])
@@ -80,13 +80,15 @@ class Simulation:
             self._refuse(Refusal.UNKNOWN_REQUEST, f"the request is {asked}; there are {known}")
 
     def reject(self, text: str) -> None:
-        """Answer a command whose checksum is wrong; `text` is the error message."""
+        """Write the refusal of a command with a wrong checksum into the STATE record; `text` is the
+        error message."""
         self._refuse(Refusal.BAD_CHECKSUM, text)
 
     def advance(self) -> None:
         """Step the world with the last command, without a request (real-time mode).
 
-        If contacts cannot be computed, the episode is closed, and the next step is refused.
+        If contacts cannot be computed, the episode ends, and steps are refused until the next
+        reset.
         """
         try:
             state = self._world.step(self._held)

@@ -38,7 +38,8 @@ MAX_TRIES = 100
 
 @compiled
 def checksum(message: Words) -> Any:
-    """Return the FNV-1a checksum of words 1 to n-2; a wrong one shows a violated protocol."""
+    """Return the FNV-1a checksum (uint64) of words 1 to n-2 of a message (n,). If it differs from
+    word n-1, the writer has violated the protocol."""
     value = FNV_OFFSET
     for i in range(1, message.shape[0] - 1):
         value = (value ^ message[i]) * FNV_PRIME
@@ -75,10 +76,11 @@ def try_read(
     local_image: Words,
     seen: int,
 ) -> tuple[int, int]:
-    """Copy the message into `local` if it is complete and newer than the sequence `seen`.
+    """Copy the message into `local` if it is complete and newer than the sequence number `seen`.
 
-    Returns (NOTHING, READ or DAMAGED; sequence of the message). The function gives up after
-    MAX_TRIES, so it never blocks. After NOTHING or DAMAGED the contents of `local` are undefined.
+    Returns (NOTHING, READ or DAMAGED; sequence number of the message). The function gives up after
+    MAX_TRIES, so it never blocks. After DAMAGED, or if it gives up, the contents of `local` are
+    undefined.
     """
     for _ in range(MAX_TRIES):
         begun = load_acquire(sequence, 0)
