@@ -29,8 +29,9 @@ def track_beams(
     distances: FloatArray,
 ) -> None:
     """Fill `distances` (n,) with the distances (m) from (x, y) to the track's edge in the
-    directions `yaw` + `angles`; -1 if the point is off the track. `edge` is the edge's distance (m)
-    from the centre. The search starts at `piece`, -1 if unknown."""
+    directions `yaw` + `angles` (n,) (rad); -1 if the point is off the track. `edge` is the edge's
+    distance (m) from the centre. The search starts at the piece with the index `piece`, -1 if
+    unknown."""
     at, _, d = locate(table, x, y, piece)
     for i in range(angles.shape[0]):
         if abs(d) > edge:
@@ -43,8 +44,9 @@ def track_beams(
 def edge_distance(
     table: Table, piece: int, x: float, y: float, direction: float, edge: float
 ) -> float:
-    """Return the distance (m) from a point on the road to the point where the ray leaves it, at
-    most RANGE_M.
+    """Return the distance (m) from a point (x, y) on the road to the point where a ray in the world
+    `direction` (rad) leaves the road, at most 200 m. `edge` (m): the edges' distance from the
+    centre.
 
     The function follows the ray from piece to piece. In each piece, both edges are lines or
     circles, and the intersection is the root of a quadratic equation.
@@ -78,8 +80,9 @@ def edge_distance(
 def leaves_edges(
     k: float, u: float, v: float, cu: float, cv: float, edge: float, passed: float
 ) -> float:
-    """Return the distance (m) along the ray, from `passed` on, at which the ray leaves an endless
-    piece of curvature k.
+    """Return the distance (m) along a ray, from `passed` on, at which the ray leaves a road of
+    constant curvature `k` (1/m) without ends. The ray starts at (u, v) m with the unit direction
+    (cu, cv), in the frame of the piece's start (u ahead, v left).
 
     The offset d of the point (u, v) is the root of k d^2 - 2 d = k (u^2 + v^2) - 2 v. So the ray's
     distance from an edge has the sign of a t^2 + 2 b t + c, without cancellation as k approaches 0.
@@ -100,8 +103,8 @@ def leaves_edges(
 
 @compiled
 def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
-    """Return the next root t >= `passed` of a t^2 + 2 half_b t + c (positive at `passed`), or
-    infinity."""
+    """Return the smallest root t >= `passed` of a t^2 + 2 half_b t + c, which is positive at t =
+    `passed`; infinity if there is no root."""
     square = half_b * half_b - a * c
     if square < 0.0:
         return math.inf
@@ -118,8 +121,9 @@ def falling_root(a: float, half_b: float, c: float, passed: float) -> float:
 def crosses_end(
     along: float, k: float, u: float, v: float, cu: float, cv: float, move: int
 ) -> float:
-    """Return the distance (m) along the ray at which it crosses the normal of the centre line
-    `along` m from the start of the piece; infinity if it never does in the direction `move`."""
+    """Return the distance (m) along a ray at which it crosses the normal of the centre line `along`
+    m from the start of a piece of curvature `k` (1/m); the ray is given as in `leaves_edges`.
+    Returns infinity unless the ray crosses it forwards (`move` = 1) or backwards (`move` = -1)."""
     half_turn = 0.5 * along * k
     sin_half, cos_half = math.sin(half_turn), math.cos(half_turn)
     chord = along if half_turn == 0.0 else along * sin_half / half_turn
@@ -141,8 +145,9 @@ def shorten_at_boxes(
     length: float,
     width: float,
 ) -> None:
-    """Shorten `distances` (n,) to the points where the beams meet boxes of `length` x `width` m.
-    `poses` (k, 6) of the boxes begin with x, y and end with yaw."""
+    """Shorten `distances` (n,) (m) of beams to the points where they meet boxes of `length` x
+    `width` m. The beams start at (x, y) in the directions `yaw` + `angles` (n,) (rad). `poses` (k,
+    6) of the boxes are x, y, z, roll, pitch, yaw."""
     for i in range(angles.shape[0]):
         for k in range(poses.shape[0]):
             turn = poses[k, 5]
@@ -160,8 +165,8 @@ def shorten_at_boxes(
 
 @compiled
 def cut(start: float, rate: float, half: float) -> tuple[float, float]:
-    """Return the t at which start + t rate enters and leaves [-half, half], else an empty
-    interval."""
+    """Return the least and the greatest t for which start + t rate lies in [-half, half], or (inf,
+    -inf) if no t does."""
     if abs(rate) < 1e-12:
         return (-math.inf, math.inf) if abs(start) <= half else (math.inf, -math.inf)
     first, second = (-half - start) / rate, (half - start) / rate

@@ -27,7 +27,8 @@ Reading = float | NDArray[Any]
 class Sensor:
     """One declared sensor; `read` returns a number or an array of `shape` in `unit`.
 
-    Readings are clipped to `limits`. Raises UserError for contradictory limits or bad noise.
+    Readings are clipped to `limits`. Raises UserError for contradictory limits, or for noise that
+    is negative or not finite.
     """
 
     name: str
@@ -86,7 +87,8 @@ class Sensor:
         return min(max(value, self.limits[0]), self.limits[1])
 
     def limit(self, exact: NDArray[Any], rng: np.random.Generator | None = None) -> NDArray[Any]:
-        """Return `exact` readings of any shape, clipped to the limits; noisy if `rng` is given."""
+        """Return the readings `exact` of any shape, clipped to the limits, with noise if `rng` is
+        given. Readings equal to `invalid` are not changed."""
         noisy = exact if rng is None else exact + rng.normal(0.0, self.noise, size=exact.shape)
         if exact.dtype.kind in "iu":
             noisy = np.rint(noisy)
@@ -96,8 +98,8 @@ class Sensor:
 
 
 class SensorSuite:
-    """Several sensors that are read together. Their noise depends only on `seed` and the order of
-    reading.
+    """Several sensors that are read together. A sensor's noise depends only on `seed`, the sensor's
+    name and the number of readings since the last restart.
 
     `noise` sets standard deviations by sensor name. Raises UserError if two sensors have the same
     name, or for noise of a sensor that is not in the suite.

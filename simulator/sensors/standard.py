@@ -1,4 +1,4 @@
-"""The sensors of the paper's table, with its ranges and units.
+"""The sensors of Li et al.'s table of sensors, with the ranges and units of that table.
 
 v_x and v_y are signed components in the body frame, so their limits are signed too. Speed and wheel
 spin are magnitudes, as in the table.
@@ -30,7 +30,8 @@ CAMERA = "camera"
 
 
 def read_track_range(world: World) -> NDArray[np.float64]:
-    """Return distances (19,) m to the track's edge, from +90 to -90 deg; -1 off the track."""
+    """Return the distances (19,) m to the track's edge along beams from +90 (left) to -90 deg from
+    the car's heading, at most 200 m; -1 if the car is off the track."""
     now, table = world.state, world.road.track.arrays()
     distances = np.empty(len(BEAM_ANGLES))
     piece = index_at(table, now.s)
@@ -39,7 +40,8 @@ def read_track_range(world: World) -> NDArray[np.float64]:
 
 
 def read_range(world: World) -> NDArray[np.float64]:
-    """Return the distances of `read_track_range`, but a beam also ends at a traffic car."""
+    """Return the distances (19,) m to the track's edge or to a traffic car, whichever is nearer,
+    along the beams of `read_track_range`; -1 if the car is off the track."""
     distances = read_track_range(world)
     if world.traffic.count and distances[0] >= 0.0:
         now = world.state
@@ -103,7 +105,8 @@ def camera_sensor(camera: Any, view: str = "front") -> Sensor:
 def picture_sensor(
     name: str, read: Callable[[World], NDArray[np.uint8]], shape: tuple[int, int, int]
 ) -> Sensor:
-    """Return a sensor of uint8 images of `shape`."""
+    """Return a sensor that reads uint8 images of `shape` (H, W, 3); `read` returns the image of a
+    world."""
     return Sensor(name, "-", read, limits=(0.0, 255.0), shape=shape, dtype="uint8")
 
 
