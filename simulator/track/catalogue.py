@@ -68,7 +68,8 @@ def read_track(path: Path) -> Track:
 
 
 def track_files(tracks_dir: Path | None = None) -> dict[str, Path]:
-    """Return the file of every track by name, in the order of the search."""
+    """Return the path of every track's file by the track's name. If several files have one name,
+    the first file in the order of the search folders is used."""
     files: dict[str, Path] = {}
     for folder in _folders(tracks_dir):
         for path in _files_in(folder):

@@ -33,8 +33,8 @@ def readable_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class TrackPose:
-    """Points of the road plane, arrays of one shape: m, heading in (-pi, pi] rad, curvature in
-    1/m."""
+    """Points of the road plane as arrays of one shape: x, y, z in m, heading in (-pi, pi] rad,
+    curvature of the centre line in 1/m."""
 
     x: FloatArray
     y: FloatArray
@@ -82,7 +82,8 @@ class Track:
         markings: MarkingStyle,
         definition_hash: str = "",
     ) -> Self:
-        """Build a track from pieces placed end to end."""
+        """Build a track of `width` m from pieces placed end to end; `look` is the name of its
+        scenery theme. A `definition_hash` replaces the hash of the geometry."""
         arrays = [getattr(placed, field.name) for field in fields(Placed) if field.name != "end"]
         track = cls(name, source, width, surface, look, markings, *arrays)
         return replace(track, definition_hash=definition_hash)
@@ -113,7 +114,8 @@ class Track:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 (hex) of the geometry; it does not depend on the track's name."""
+        """`definition_hash` if it is set, otherwise the SHA-256 (hex) of the geometry. The hash
+        does not depend on the track's name."""
         return (
             self.definition_hash
             or hashlib.sha256(
@@ -168,8 +170,9 @@ class Track:
     def project(self, x: float, y: float, hint_s: float | None = None) -> tuple[float, float]:
         """Return the track coordinates (s, to_middle) in m of a world point (m).
 
-        Without `hint_s` the whole centre line is searched. With it, only the part near that s is
-        searched, which distinguishes a bridge from the road below it.
+        Without `hint_s` the whole centre line is searched. With `hint_s`, the part near that s is
+        searched first, which distinguishes a bridge from the road below it; the whole centre line
+        is searched only if the point is not found there.
         """
         table = self.arrays()
         hint = -1 if hint_s is None else piece_table.index_at(table, float(hint_s))

@@ -44,8 +44,8 @@ Row = tuple[float, float, float, int]
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps cut from segments, (n,) arrays: length, curvature, banking (left edge up) at the
-    end."""
+    """Short parts ("steps") of constant curvature, cut from segments. Arrays (n,): length in m,
+    curvature in 1/m, banking at the end in rad (positive if the left edge is higher)."""
 
     length: FloatArray
     curvature: FloatArray
@@ -101,7 +101,8 @@ def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
 
 
 def place(steps: Steps) -> Placed:
-    """Place the steps in the plane, without heights. No step is so long that it must be split."""
+    """Place the steps end to end in the plane, without heights. A step is at most 5 m long, so it
+    never turns by more than a quarter circle and becomes one piece."""
     return put(steps.length, steps.curvature, np.zeros((len(steps.length), 4)))
 
 
@@ -137,8 +138,8 @@ def close(segments: list[Segment]) -> tuple[list[Segment], float]:
 
 
 def segment_length(segment: Segment) -> float:
-    """Return the length (m) of a segment along the centre line. The two spirals of a bend together
-    add the length of one spiral to the arc's."""
+    """Return the length (m) of a segment along the centre line. A bend with spirals is longer than
+    an arc of the same angle by the length of one spiral."""
     if isinstance(segment, Straight):
         return segment.length
     return abs(segment.angle) * segment.radius + segment.spiral
@@ -176,7 +177,8 @@ def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> Fl
 
 
 def lay(segments: list[Segment], width: float, vertical_curve: float) -> list[Piece]:
-    """Return the pieces of a closed list of segments (see `close`); `width` of the track in m."""
+    """Return the pieces of a closed list of segments (see `close`), for a track `width` m wide.
+    Grades are averaged over `vertical_curve` m."""
     steps = cut(segments)
     s = np.concatenate(([0.0], np.cumsum(steps.length)))
     z = heights(segments, s, vertical_curve)

@@ -29,11 +29,12 @@ HINT_REACH_M = 40.0
 
 @inlined
 def foot(table: Table, index: int, x: float, y: float) -> tuple[float, float]:
-    """Return the foot point of (x, y) on piece `index`, extended beyond both ends: (local s,
-    to_middle).
+    """Return the foot point of (x, y) on piece `index`, extended beyond both ends, as (distance
+    along the piece from its start, to_middle) in m.
 
     The formula is exact on arcs, without cancellation as the curvature approaches 0. A piece turns
-    by at most a quarter circle (see `pieces.assemble`), so the angle never wraps near it.
+    by at most a quarter circle (see `pieces.assemble`), so for points near the piece the angle does
+    not wrap.
     """
     dx = x - table[index, X0]
     dy = y - table[index, Y0]
@@ -63,7 +64,8 @@ def centre_point(table: Table, index: int, along: float) -> tuple[float, float]:
 
 @compiled
 def complete_table(table: Table) -> None:
-    """Fill the columns that are computed from other columns."""
+    """Fill the columns COS0 and SIN0 (of the heading), LEFT_SLOPE and RIGHT_SLOPE (dz/ds of the
+    edges), which are computed from the other columns."""
     for index in range(table.shape[0]):
         row = table[index]
         row[COS0], row[SIN0] = math.cos(row[HEADING0]), math.sin(row[HEADING0])
@@ -81,7 +83,8 @@ def index_at(table: Table, s: float) -> int:
 
 @compiled
 def index_near(table: Table, s: float, hint: int) -> int:
-    """Return `index_at(table, s)`; this is faster if `s` is on piece `hint` or one of the next."""
+    """Return the index of the piece that contains `s`; s wraps round the lap. The whole table is
+    searched only if s is neither on piece `hint` nor on one of the 63 pieces after it."""
     wrapped, count = wrap(table, s), table.shape[0]
     for index in range(hint, min(hint + MAX_WALK, count)):
         if wrapped < table[index, S0]:
@@ -101,8 +104,8 @@ def wrap(table: Table, s: float) -> float:
 
 @compiled
 def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, float]:
-    """Find the nearest point of the whole centre line; returns the same as `locate`. Of equally
-    near points the first is used."""
+    """Return the track coordinates (piece index, s, to_middle) of the world point (x, y), from the
+    nearest point of the whole centre line. Of several equally near points the first is used."""
     best, best_s, best_d, best_squared = 0, 0.0, 0.0, math.inf
     for index in range(table.shape[0]):
         reach = table[index, LENGTH]
@@ -203,8 +206,8 @@ def foot_offset(table: Table, index: int, s: float, to_middle: float, z: float) 
 
 @compiled
 def pose_at(table: Table, s: float) -> tuple[float, float, float, float, float]:
-    """Return the centre line's pose (x, y, z, heading, curvature) at `s`, which wraps; heading does
-    not."""
+    """Return the centre line's pose (x, y, z, heading, curvature) at `s`, which wraps round the
+    lap. The heading (rad) is not wrapped into (-pi, pi]."""
     index = index_at(table, s)
     wrapped = wrap(table, s)
     along = wrapped - table[index, S0]

@@ -34,7 +34,8 @@ class Piece:
 
 @dataclass(frozen=True)
 class Placed:
-    """Pieces placed end to end in the plane, all arrays (P,), and the end of the last piece."""
+    """Pieces placed end to end in the plane. The arrays (P,) have one entry per piece; `end` is the
+    pose at the end of the last piece."""
 
     s0: FloatArray
     length: FloatArray
@@ -51,7 +52,8 @@ class Placed:
 
 
 def split_turns(pieces: list[Piece]) -> list[Piece]:
-    """Cut every piece that turns by more than `MAX_TURN` into equal parts; heights stay linear."""
+    """Cut every piece that turns by more than a quarter circle into equal parts. The edge heights
+    of the parts are interpolated linearly."""
     cut: list[Piece] = []
     for piece in pieces:
         parts = max(1, math.ceil(abs(piece.curvature) * piece.length / MAX_TURN - 1e-9))
@@ -94,8 +96,9 @@ def put(
     y: float = 0.0,
     heading: float = 0.0,
 ) -> Placed:
-    """Place pieces (P,) that turn by at most `MAX_TURN` end to end from the pose (x, y, heading).
-    `heights` (P, 4) are those of the left and right edge at the start, then at the end."""
+    """Place pieces with `length` (P,) and `curvature` (P,) end to end from the pose (x, y,
+    heading). Each piece turns by at most a quarter circle. The columns of `heights` (P, 4) are the
+    heights of the left and right edge at the piece's start, then at its end."""
     turn = curvature * length
     headings = heading + np.concatenate(([0.0], np.cumsum(turn)))
     # np.sinc(t) = sin(pi t)/(pi t) gives the chord of an arc that turns by `turn`.
@@ -119,7 +122,8 @@ def put(
 
 
 def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> None:
-    """Raises TrackError unless the end of the last piece meets the start of the first."""
+    """Raises TrackError unless the end of the last piece is within `max_gap_m` (horizontally and in
+    height) and 0.5 deg of the start of the first. `what` names the track in the message."""
     x, y, heading = placed.end
     gap = math.hypot(x - placed.x0[0], y - placed.y0[0])
     height = max(

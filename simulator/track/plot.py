@@ -54,7 +54,8 @@ class Lap:
 
 
 def sample(road: Road) -> Lap:
-    """Sample the lap of `road` every metre, or at 6000 points if the lap is longer than 6 km."""
+    """Sample the lap of `road` at equal distances of about 1 m, or at 6001 points if the lap is
+    longer than 6 km."""
     track = road.track
     count = min(round(track.length_m), MOST_SAMPLES)
     s = np.linspace(0.0, track.length_m, count + 1)
@@ -68,7 +69,8 @@ def sample(road: Road) -> Lap:
 
 
 def runs(classes: NDArray[np.int64]) -> list[tuple[int, int, tf.RoadClass]]:
-    """Return the stretches of one class as (first sample, last sample + 1, class)."""
+    """Split `classes` (N,) of the samples round the lap into stretches of one class. Returns (index
+    of the first sample, index of the last sample + 1, class) of each stretch."""
     cuts = np.flatnonzero(np.diff(classes)) + 1
     bounds = [0, *cuts.tolist(), len(classes)]
     return [(first, last, tf.RoadClass(int(classes[first]))) for first, last in pairwise(bounds)]
@@ -180,7 +182,8 @@ def _point(xy: FloatArray) -> tuple[float, float]:
 
 
 def tick_step(length: float) -> int:
-    """Return a round distance (m) between ticks that gives at most 16 of them."""
+    """Return a round distance (m) between the ticks of a lap of `length` m, so that there are at
+    most 16 ticks."""
     return next((step for step in TICKS_M if length / step <= MOST_TICKS), 10_000)
 
 

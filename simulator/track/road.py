@@ -21,11 +21,12 @@ that a car has left the track before any part of it touches a wall."""
 
 @dataclass(frozen=True)
 class Road:
-    """`lanes` lanes of width `lane_width` (m), centred on `track`; a narrower track is widened.
+    """`lanes` lanes of width `lane_width` (m), centred on `track`. A track narrower than the lanes
+    and shoulders is widened.
 
-    `carriageway` contains the lines and shoulders of a varied road. With None the road has the
-    paper's shoulders and one line per marking. Raises UserError for a number or width of lanes
-    outside the definitions, or different from the carriageway's.
+    `carriageway` contains the lines and shoulders of a varied road; if it is None, the road has
+    shoulders of 1 m, as in the paper, and one line per marking. Raises UserError unless the road
+    has 1 to 3 lanes of 2.7 to 4.5 m, in agreement with the carriageway.
     """
 
     track: Track
@@ -50,12 +51,14 @@ class Road:
 
     @property
     def half_width(self) -> float:
-        """Half of the track's own width (`w` of reward and state); the least value of `edge`."""
+        """Half of the track's own width, which scales the offset in the reward and in the state
+        vector. It is at most `edge`."""
         return self.track.width / 2
 
     @property
     def asphalt(self) -> tuple[float, float]:
-        """Distances from the centre to the left and to the right end of the asphalt."""
+        """Distances from the centre to the left and to the right end of the asphalt, both
+        positive."""
         half = self.lanes * self.lane_width / 2
         left, right = self.carriageway.shoulders_m if self.carriageway else (SHOULDER_M,) * 2
         return half + left, half + right
@@ -67,7 +70,8 @@ class Road:
 
     @property
     def edge(self) -> float:
-        """Distance from the centre beyond which a car is off the track; range beams end there."""
+        """Distance from the centre to the edge. A car whose centre of gravity is farther out is off
+        the track; range beams end at the edge."""
         return max(self.half_width, self.half_asphalt)
 
     @property
@@ -81,8 +85,8 @@ class Road:
         return tf.marking_offsets(self.lanes, self.lane_width)
 
     def lines_y(self, to_middle: float) -> NDArray[np.float64]:
-        """Return the lateral positions (lanes + 1,) of the lines that bound lanes for a car at
-        `to_middle`. Of the lines of a double line, the one nearer to the car's lane counts."""
+        """Return the lateral positions (lanes + 1,) of the lines that bound the lanes of a car at
+        `to_middle`. For a double line this is the line nearer to the car's lane."""
         if not self.line_offsets:
             return self.markings_y
         lane = tf.lane_index(to_middle, self.lanes, self.lane_width)

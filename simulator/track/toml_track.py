@@ -6,8 +6,8 @@
     [[segment]]  type = "bend", radius (m), angle (deg, left positive, spirals included),
                  spiral (m, each end), banking (deg, outer edge up)
     grade (%, uphill positive) of a segment holds until a later segment sets another one.
-    hash         "segments": the track's hash is that of the numbers in the file, which are the same
-                 on every machine; "geometry" (default): that of the pieces computed from them
+    hash         "segments": the track's hash is computed from the numbers in the file, which are
+                 the same on every machine; "geometry" (default): from the pieces computed from them
 
 The bends must turn by +-360 degrees in total. Straights are adjusted by up to a metre so that the
 loop closes exactly. The mean grade is subtracted so that the heights close too.
@@ -55,7 +55,8 @@ class Table:
     where: str
 
     def number(self, key: str, lo: float, hi: float, default: float | None = None) -> float:
-        """Return the number `key`. Raises TrackError unless it is within `lo` to `hi`."""
+        """Return the number `key`, or `default` if there is no `key`. Raises TrackError unless the
+        result is a number from `lo` to `hi`."""
         value = self.values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not lo <= value <= hi:
             raise TrackError(
@@ -64,14 +65,16 @@ class Table:
         return float(value)
 
     def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
-        """Return the text `key`. Raises TrackError unless it is one of `choices`."""
+        """Return the text `key`, or `default` if there is no `key`. Raises TrackError unless the
+        result is one of `choices`."""
         value = self.values.get(key, default)
         if value not in choices:
             raise TrackError(f"{self.where}: {key} is {value!r}, expected one of {choices}")
         return str(value)
 
     def only(self, *keys: str) -> None:
-        """Raises TrackError for unknown keys, because a misspelt key would have no effect."""
+        """Raises TrackError if the table has a key that is not in `keys`, because a misspelt key
+        would have no effect."""
         for key in self.values:
             if key not in keys:
                 raise TrackError(f"{self.where}: unknown key {key!r}, expected {', '.join(keys)}")
@@ -137,7 +140,8 @@ def _closed(written: list[Segment], where: str) -> list[Segment]:
 
 
 def read_segments(table: Table) -> list[Segment]:
-    """Return the segments as written, before the loop is closed. A grade holds until the next."""
+    """Return the segments as written, before the loop is closed. A segment without a grade has the
+    grade of the segment before it; the first has 0."""
     rows = table.values.get("segment")
     if not isinstance(rows, list) or not 3 <= len(rows) <= 1000:
         raise TrackError(f"{table.where}: expected 3 to 1000 [[segment]] tables")

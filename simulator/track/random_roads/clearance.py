@@ -19,10 +19,10 @@ BULGE_M: Final = 0.3
 
 
 def keeps_clear(segments: list[Segment]) -> bool:
-    """Return whether all parts of a closed course are at least `CLEARANCE_M` apart.
+    """Return whether the centre lines of all parts of a closed course are at least 24 m apart.
 
-    Points whose distance along the road is less than half a circle of diameter `CLEARANCE_M` are
-    not compared: they lie in one bend, and no radius is below half of `CLEARANCE_M`.
+    Points that are less than 12 pi m apart along the road are not compared: they lie in one bend,
+    and no bend's radius is below 12 m.
     """
     placed = place(cut(segments))
     total = float(placed.s0[-1] + placed.length[-1])

@@ -1,7 +1,7 @@
 """The course of a random road in the plane: a polygon whose corners are rounded to bends.
 
 A polygon is closed, so the road closes without a search. Lengths are in metres, angles in degrees,
-left positive; both have the resolution of the TOML file.
+left positive. Both are rounded to the number of decimals that the TOML file contains.
 """
 
 import math
@@ -32,7 +32,8 @@ class DoesNotFit(Exception):
 
 @dataclass(frozen=True)
 class Arc:
-    """An arc of a bend; it is one row of the TOML file."""
+    """An arc of a bend, with spirals before and after it. It is written as one [[segment]] of the
+    TOML file."""
 
     radius: float
     angle: float
@@ -43,7 +44,8 @@ class Arc:
         return Bend(self.radius, math.radians(self.angle), self.spiral, 0.0, 0.0)
 
     def scaled(self, factor: float) -> "Arc":
-        """Return the arc scaled by `factor`, with spirals rounded down so that they still fit."""
+        """Return the arc with radius and spirals multiplied by `factor`. The spirals are rounded
+        down, so that they are not too long for the arc."""
         return replace(
             self,
             radius=round(self.radius * factor, 2),
@@ -63,7 +65,9 @@ class Course:
 
 
 def draw_course(kind: Kind, unevenness: float, rng: np.random.Generator) -> Course:
-    """Return a random closed course of `kind`; it may cross itself. Raises DoesNotFit."""
+    """Return a random closed course of `kind`, which may cross itself. The logarithm of the
+    corners' relative distances from the centre is random in [-unevenness, unevenness]. Raises
+    DoesNotFit."""
     points = _polygon(kind, unevenness, rng)
     edges = np.roll(points, -1, axis=0) - points  # edge i leads from corner i to corner i + 1
     lengths = np.hypot(edges[:, 0], edges[:, 1])

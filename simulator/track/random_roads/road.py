@@ -1,7 +1,7 @@
 """Random roads: the track `random:SEED`, which its seed determines.
 
-The errors of the angle are largest, and biased, in tight bends and at changes of curvature. Few
-frames of other tracks show such places; on random roads half of the frames do.
+The network's angle has its largest errors, and a bias, in tight bends and at changes of curvature.
+Few frames of other tracks show such places; on random roads half of the frames do.
 
 The road is generated as the content of a TOML file (see `toml_track`), in decimals. The same seed
 gives the same decimals on every machine: the random numbers are those of numpy's PCG64, and

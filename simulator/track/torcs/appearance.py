@@ -1,7 +1,7 @@
 """Selects the scenery of an imported TORCS track from its category, surface, name and height.
 
-TORCS stores scenery in 3D models, which are not read. A track whose name contains no word of NAMED
-gets a random look that suits a track with, or without, kerbs.
+TORCS stores scenery in 3D models, which are not read. If the track's name contains no word of the
+list NAMED, the look is random, from looks for tracks with kerbs or from looks for tracks without.
 """
 
 import hashlib
@@ -31,7 +31,8 @@ WITHOUT_KERBS: Final = ("countryside", "forest", "ring-road", "highway")
 def surface_and_look(
     name: str, root: Section, main: Section, placed: Placed
 ) -> tuple[Surface, str]:
-    """Return the surface and the look (scenery theme) of the track called `name`."""
+    """Return the surface and the look (scenery theme) of the track called `name`. `root` is the
+    root section of its file, `main` the section "Main Track"."""
     surface = _surface(root, main)
     if surface == "gravel":
         return surface, "gravel"
@@ -48,7 +49,7 @@ def surface_and_look(
 
 
 def has_kerbs(main: Section) -> bool:
-    """Return whether any segment of the track has a kerb beside it."""
+    """Return whether any segment in the section `main` ("Main Track") has a kerb beside it."""
     return any(
         "curb" in (attribute.get("val") or "").lower()
         for attribute in main.element.iter("attstr")

@@ -27,8 +27,9 @@ Edges = NDArray[np.float64]
 
 @dataclass
 class Profile:
-    """Values that a segment passes to the next segment: heights and slopes of the edges at its end,
-    and the grade, which holds until a segment sets another grade."""
+    """Values that a segment passes to the next segment: heights (m) and slopes (dz/ds) of both
+    edges at the segment's end, and the grade (dz/ds), which holds until a segment sets another
+    grade."""
 
     end: Edges
     tangent: Edges
@@ -36,7 +37,9 @@ class Profile:
 
 
 def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piece]:
-    """Yield the pieces of all segments in order; each segment is cut into its profile steps."""
+    """Yield the pieces of all segments in the section `segments`, in order. Each segment is cut
+    into TORCS's profile steps. `main` is the section "Main Track", `width` (m) the track's
+    width."""
     global_step = main.length("profil steps length") or 0.0
     profile = Profile(end=np.zeros(2), tangent=np.zeros(2))
     for segment in segments.sections():

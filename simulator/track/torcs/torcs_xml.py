@@ -56,7 +56,8 @@ class Section:
         return self._number(name, LENGTH, "a length")
 
     def number(self, name: str) -> float | None:
-        """Return the numeric attribute `name`: an angle (rad), a slope or a plain number."""
+        """Return the numeric attribute `name`: an angle (rad), a slope or a plain number; None if
+        absent. Raises TrackError if it is not finite or has a unit of another kind."""
         return self._number(name, RATIO, "an angle, a ratio or a plain number")
 
     def _number(self, name: str, dimension: Dimension, expected: str) -> float | None:
@@ -83,7 +84,7 @@ class Section:
         return value * read.factor
 
     def text(self, name: str) -> str | None:
-        """Return an `attstr`, None if absent."""
+        """Return the string attribute (`attstr`) `name`, None if absent."""
         attribute = self._attribute("attstr", name)
         return None if attribute is None else attribute.get("val", "")
 

@@ -65,7 +65,8 @@ _PART: Final = re.compile(r"([^./2]*)([./2]|$)")
 
 
 def parse_unit(text: str) -> Unit | None:
-    """Return the unit that `text` names, None for ANY. Raises KeyError with an unknown name."""
+    """Return the unit that `text` names, or None if `text` stands for no unit ("", "none" or "SI").
+    Raises KeyError for an unknown unit name."""
     text = text.strip()
     if text in ANY:
         return None
