@@ -1,7 +1,9 @@
 """Compiled functions on the table of all traffic cars: leaders, lane changes, speeds, positions.
 
-Track frame: s along the centre line, y to the left, m and m/s. During a lane change a car occupies
-both lanes, and cars in both lanes follow it.
+`cars` (n, 10) has a row per traffic car; `bodies` (n + 1, 6) has the extent, speed and desired
+speed of each traffic car and, in the last row, of the ego car. Track frame: s along the centre
+line, y to the left, m and m/s; `length` is the length of the lap. During a lane change a car
+occupies both lanes, and cars in both lanes follow it.
 """
 
 import math
@@ -48,12 +50,14 @@ def nearest_body(
     length: float,
     ahead: bool,
 ) -> tuple[int, float]:
-    """Return the nearest body in the corridor [right, left], ahead or behind: (row, bumper gap in
-    m).
+    """Return (row in `bodies`, bumper gap in m) of the nearest body ahead of `s`, or behind `s` if
+    `ahead` is False. The row `me` does not count, nor do bodies outside the lateral range `right`
+    to `left` (m), widened by 0.3 m on both sides. `half_length` (m) is half the length of the car
+    at `s`.
 
-    It is (-1, inf) if there is none. The gap is negative if the two overlap lengthwise. Of two
-    bodies at the same s, the one with the higher row is ahead, so that one of the two follows the
-    other.
+    Returns (-1, inf) if there is no such body. The gap is negative if the car and the body overlap
+    lengthwise. Of two bodies at the same s, the one with the higher row is ahead, so that one of
+    the two follows the other.
     """
     found, smallest = -1, math.inf
     for other in range(bodies.shape[0]):
@@ -85,7 +89,8 @@ def following_acceleration(
     half_length: float,
     length: float,
 ) -> float:
-    """Return the IDM acceleration (m/s2) of a car at `s` in the corridor [right, left]."""
+    """Return the IDM acceleration (m/s2) of the car `me` at `s` with `speed` and the desired speed
+    `desired` (m/s), behind the nearest body in the lateral range `right` to `left` (m)."""
     lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     lead_speed = bodies[lead, B_SPEED] if lead >= 0 else speed
     return idm_acceleration(gap, speed, lead_speed, desired)
@@ -102,8 +107,9 @@ def lane_change_safe(
     half_length: float,
     length: float,
 ) -> tuple[bool, float]:
-    """Return whether a car may change into the corridor: (both gaps are safe, loss of acceleration
-    of the new follower in m/s2)."""
+    """Return whether the car `me` at `s` may change into the lateral range `right` to `left` (m),
+    that is, whether the gaps to the new leader and to the new follower are safe; and the
+    acceleration (m/s2) that the new follower loses."""
     lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     if lead >= 0:
         lead_speed = bodies[lead, B_SPEED]
@@ -137,7 +143,8 @@ def lane_change_safe(
 def update_bodies(
     cars: FloatArray, bodies: FloatArray, half_length: float, half_width: float
 ) -> None:
-    """Update the rows of all traffic cars in `bodies` (n + 1, BODY_COLUMNS), except struck cars."""
+    """Update the rows of all traffic cars in `bodies` (n + 1, 6), except struck cars. `half_length`
+    and `half_width` (m) are half the size of a traffic car."""
     for i in range(cars.shape[0]):
         if cars[i, STRUCK] > 0.0:
             continue
@@ -158,7 +165,9 @@ def decide_lane_change(
     half_width: float,
     length: float,
 ) -> None:
-    """Start a lane change of car `i` if it is safe and gains enough (MOBIL, Kesting 2007)."""
+    """Start a lane change of car `i` into the best adjacent lane, if it is safe and the car gains
+    at least 0.2 m/s2 more acceleration than 0.2 times the new follower's loss (MOBIL, Kesting
+    2007). `lane_y` (lanes,) are the lateral positions (m) of the lane centres."""
     y, speed, half_length = cars[i, Y_TO], cars[i, SPEED], bodies[i, B_HALF_LENGTH]
     s, desired = cars[i, S], cars[i, DESIRED]
     here = following_acceleration(
@@ -232,8 +241,9 @@ def step_traffic(
     half_length: float,
     half_width: float,
 ) -> None:
-    """Advance all cars by one step of `dt` s; `speed_limit` (cells,) is in m/s, in equal cells
-    along s.
+    """Advance all cars by one step of `dt` s. `lane_y` (lanes,) are the lateral positions (m) of
+    the lane centres, `table` is the track's table. `speed_limit` (cells,) in m/s holds in equal
+    parts of the lap.
 
     Lane changes are decided one car after the other, based on the earlier decisions. All
     accelerations are computed from the state before the step.
@@ -296,8 +306,9 @@ def update_poses(cars: FloatArray, table: FloatArray, poses: FloatArray) -> None
 
 @compiled
 def limit_deceleration(squared: FloatArray, gain: float) -> None:
-    """Lower the squared speed limits (n,) of cells along a loop, in place, so that from each cell
-    to the next they decrease by at most `gain` (m2/s2), the decrease by braking within a cell."""
+    """Lower squared speed limits (n,) (m2/s2) of equal cells round the lap, in place, so that the
+    limit of a cell exceeds the limit of the next by at most `gain`. A car that brakes with `gain` /
+    (2 x length of a cell) in m/s2 can then keep to them."""
     cells = squared.shape[0]
     for cell in range(2 * cells - 1, -1, -1):  # two laps, because the cells form a loop
         ahead = squared[(cell + 1) % cells] + gain

@@ -83,7 +83,8 @@ class Traffic:
         return self._cars[:, car_table.DESIRED].copy()
 
     def poses(self) -> FloatArray:
-        """Return x, y, z, roll, pitch, yaw (n, 6) (m, rad) of the ground points under the cars."""
+        """Return the poses (n, 6) of the ground points under the cars: x, y, z (m), roll, pitch,
+        yaw (rad) in the world frame."""
         return self._poses.copy()
 
     def step(self, dt: float, ego_s: float, ego_to_middle: float, ego_speed: float) -> None:
@@ -115,8 +116,9 @@ class Traffic:
         self._cars[row, car_table.CHANGE_PROGRESS] = 1.0
 
     def set_struck_pose(self, row: int, pose: FloatArray, track_state: FloatArray) -> None:
-        """Set the ground `pose` (6,) of a struck car; `track_state` (4,) is s, to_middle, angle and
-        speed along the track. Other cars avoid its bounding box in the track frame."""
+        """Set the pose (6,) of a struck car: x, y, z, roll, pitch, yaw of the ground point under
+        it. `track_state` (4,) is s, to_middle, angle (m, rad) and the speed along the track (m/s).
+        Other cars avoid the car's bounding box in the track frame."""
         s, to_middle, angle, speed = track_state
         cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
         half_length = 0.5 * (TRAFFIC_CAR_SIZE[0] * cos + TRAFFIC_CAR_SIZE[1] * sin)
@@ -144,7 +146,8 @@ class Traffic:
         return None if row < 0 else (float(gap), float(self._bodies[row, car_table.B_SPEED]))
 
     def has_room(self, s: float, to_middle: float, speed: float) -> bool:
-        """Return whether both gaps are safe if the ego car at `s` changes to `to_middle`."""
+        """Return whether the ego car at `s` (m) with `speed` (m/s) can move to the lateral position
+        `to_middle` (m) with safe gaps to the car ahead and to the car behind it there."""
         half = 0.5 * EGO_CAR_SIZE[1]
         safe, _ = car_table.lane_change_safe(
             self._bodies,

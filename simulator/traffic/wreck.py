@@ -57,7 +57,9 @@ _CONTROLS = np.array([0.0, 0.0, BRAKE, 0.0])
 
 @dataclass
 class Wreck:
-    """One struck car, `moving` until it is at rest; `motion` and `memory` as in `dynamics`."""
+    """One struck car, `moving` until it is at rest. `motion` (13,) is position, quaternion (x, y,
+    z, w), velocity and angular velocity in the world frame; `memory` (8,) is the car's internal
+    state (see `dynamics`)."""
 
     row: int
     """Index of the car in the traffic."""
@@ -69,8 +71,8 @@ class Wreck:
     def from_traffic(
         cls, row: int, motion: FloatArray, s: float, speed: float, table: Table
     ) -> "Wreck":
-        """Make a wreck of traffic car `row`, which drove `speed` m/s at `s` m; `motion` (13,) is
-        its motion after the impact."""
+        """Make a wreck of traffic car `row`, which drove `speed` m/s at `s` m. `motion` (13,) is
+        the array in which the caller stores the car's motion after the impact."""
         memory = np.zeros(MEMORY)
         memory[PIECE] = index_at(table, s)
         memory[SPIN : SPIN + 4] = speed / TRAFFIC_CAR.wheel_radius
@@ -78,7 +80,9 @@ class Wreck:
         return cls(row, motion, memory)
 
     def forces(self, params: NDArray[Any], table: Table, ground: Ground) -> FloatArray:
-        """Return force and torque (6,) of road, air and gravity for the next physics step."""
+        """Return the force and torque (6,) (N, N m, world frame) of road, air and gravity on the
+        wreck for the next physics step. `params` are the traffic car's parameters, `table` is the
+        track's table."""
         wrench = np.empty(6)
         compute_forces(params, table, ground, self.motion, self.memory, _CONTROLS, wrench)
         return wrench
@@ -91,7 +95,8 @@ class Wreck:
             self.motion[7:13] = 0.0
 
     def pose_for_traffic(self, table: Table) -> tuple[FloatArray, FloatArray]:
-        """Return the ground pose (6,), and s, to_middle, angle and speed along the track (4,)."""
+        """Return the pose (x, y, z, roll, pitch, yaw) of the ground point under the wreck, and (s,
+        to_middle, angle, speed along the track)."""
         readings = np.empty(TRACK_STATE_SIZE)
         measure_track_state(table, self.motion, self.memory, readings)
         up = rotation(self.motion[3:7])[2]
@@ -105,8 +110,9 @@ class Wreck:
 def lane_motion(
     pose: FloatArray, move: FloatArray, share: float, dt: float, motion: FloatArray
 ) -> None:
-    """Fill `motion` (13,) of a traffic car in its lane. `pose` (6,) is its ground pose at the start
-    of a control step of `dt` s, `move` (6,) its change over the step, `share` the fraction done."""
+    """Fill `motion` (13,) (position, quaternion, velocity, angular velocity) of a traffic car in
+    its lane. `pose` (6,) is its ground pose at the start of a control step of `dt` s, `move` (6,)
+    the change of the pose over the step, `share` the fraction of the step already done."""
     roll = 0.5 * (pose[3] + share * move[3])
     pitch = 0.5 * (pose[4] + share * move[4])
     yaw = 0.5 * (pose[5] + share * move[5])

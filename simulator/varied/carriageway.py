@@ -45,12 +45,14 @@ class Marking:
 
     @property
     def left_m(self) -> float:
-        """Offset of the line that bounds the lane on the left of the marking."""
+        """Offset, left positive, of the marking's leftmost line from the nominal position. This
+        line bounds the lane on the left. 0 if there is no line."""
         return self.lines[0].offset_m if self.lines else 0.0
 
     @property
     def right_m(self) -> float:
-        """Offset of the line that bounds the lane on the right of the marking."""
+        """Offset, left positive, of the marking's rightmost line from the nominal position. This
+        line bounds the lane on the right. 0 if there is no line."""
         return self.lines[-1].offset_m if self.lines else 0.0
 
 
@@ -90,7 +92,8 @@ class Carriageway:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Carriageway":
-        """Return the carriageway with `values`. Raises KeyError, TypeError or ValueError if bad."""
+        """Return the carriageway whose `dataclasses.asdict` is `values`, also after a round trip
+        through JSON. Raises KeyError, TypeError or ValueError if a field is missing or unknown."""
         found: Carriageway = rebuilt(Carriageway, values)
         return found
 
@@ -98,8 +101,9 @@ class Carriageway:
 def camera_heights(
     lane_width_m: float, narrowest_m: float = math.inf, model_height_m: float = MODEL_HEIGHT_M
 ) -> tuple[float, float]:
-    """Return the least and greatest camera height (m) with which lanes appear within
-    APPARENT_WIDTH_M.
+    """Return the least and greatest camera height (m) with which a model sees lanes 2.75 to 4.4 m
+    wide, within 0.9 to 2.2 m if possible. `model_height_m` is the height of the model's training
+    camera.
 
     `narrowest_m` is the width of the narrowest lane, since a double line occupies some of the
     width.

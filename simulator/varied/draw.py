@@ -83,10 +83,11 @@ def _value(value: Any, drawn: Values, scale: float, rng: np.random.Generator) ->
 
 
 def rebuilt(kind: Any, value: Any) -> Any:
-    """Return the object of type `kind` whose `dataclasses.asdict` is `value`; also after JSON,
-    which turns tuples into lists.
+    """Return the object of type `kind` whose `dataclasses.asdict` is `value`. `value` may have been
+    stored as JSON, which turns tuples into lists.
 
-    Raises KeyError, TypeError or ValueError for values of another type.
+    Raises KeyError, TypeError or ValueError if fields are missing or unknown, or if a tuple has
+    another length. The types of numbers and texts are not checked.
     """
     if is_dataclass(kind):
         hints = get_type_hints(kind)

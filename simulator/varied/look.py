@@ -179,6 +179,7 @@ class RoadLook:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "RoadLook":
-        """Return the look with these values. Raises KeyError, TypeError or ValueError if bad."""
+        """Return the look whose `as_dict` is `values`. Raises KeyError, TypeError or ValueError if
+        a field is unknown or has another structure."""
         look: RoadLook = rebuilt(RoadLook, values)
         return look

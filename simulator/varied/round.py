@@ -23,6 +23,7 @@ class VariedRound:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "VariedRound":
-        """Return the round with these values. Raises KeyError, TypeError or ValueError if bad."""
+        """Return the round whose `dataclasses.asdict` is `values`, also after a round trip through
+        JSON. Raises KeyError, TypeError or ValueError if a field is missing or unknown."""
         found: VariedRound = rebuilt(VariedRound, values)
         return found
