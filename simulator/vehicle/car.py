@@ -154,7 +154,8 @@ class CarParameters:
         )
 
     def cornering_stiffness(self, front: bool, grip: float) -> float:
-        """Return the cornering stiffness (N/rad) of one tyre at static load, with this `grip`."""
+        """Return the cornering stiffness (N/rad) of one front or rear tyre at static load; `grip`
+        is the surface's factor on the friction coefficient."""
         load = self.static_loads[0 if front else 1]
         share = load / (self.working_load * load * self.mass / self.total_mass)
         spread = self.friction_unloaded - self.friction_overloaded

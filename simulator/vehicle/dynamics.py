@@ -1,8 +1,9 @@
 """Forces of wheels, air and gravity on the car's body, in one compiled step of 1/200 s.
 
 World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units. `p`
-is the record `CarParameters.packed()[0]`. This module computes force and torque; `rigid_body` or
-PyBullet moves the body.
+is the record `CarParameters.packed()[0]`; `axes` (3, 3) has the body axes as rows; `velocity` (6,)
+is linear, then angular; `wrench` (6,) is force, then torque; all three are in the world frame. This
+module computes the wrench; `rigid_body` or PyBullet moves the body.
 """
 
 import math
@@ -68,7 +69,8 @@ def make_work() -> Work:
 
 @compiled
 def forget_turn(work: Work) -> None:
-    """Make the next step compute the wheels' angles anew, because it may be another car's."""
+    """Discard the wheel angles stored in `work`, which may be another car's, so that the next step
+    computes them."""
     work[4][0] = math.nan
 
 
@@ -96,10 +98,11 @@ def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
 def update_wheel_speeds(
     p: Any, memory: FloatArray, command: FloatArray, wheels: FloatArray, slip_gain: FloatArray
 ) -> None:
-    """Advance the four wheel speeds and the engine speed in `memory` by one step, implicitly in the
-    tyre force.
+    """Advance the four wheel speeds and the engine speed in `memory` (8,) by one step. The
+    integration is implicit in the tyre force, because tyres are stiff.
 
-    slip_gain (4,): tyre force per m/s of slip speed (N s/m); command: steer, throttle, brake, gear.
+    command (4,): steer, throttle, brake, gear; wheels (4, 20): see `wheels`; slip_gain (4,): tyre
+    force per m/s of slip speed (N s/m).
     """
     r, gear = p.wheel_radius, int(command[3])
     ratio = gear_ratio(p, gear)
@@ -141,7 +144,7 @@ def update_wheel_speeds(
 
 @inlined
 def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: FloatArray) -> None:
-    """Add drag and both axles' downforce, quadratic in forward speed, to `wrench` (6,)."""
+    """Add drag and the downforce of both axles, quadratic in the forward speed, to `wrench`."""
     speed = axes[0, 0] * velocity[0] + axes[0, 1] * velocity[1] + axes[0, 2] * velocity[2]
     pressure = 0.5 * p.air_density * speed * speed
     drag = pressure * (p.drag_coefficient * p.frontal_area + p.wing_drag)
@@ -159,8 +162,9 @@ def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: Flo
 def add_underbody_contact(
     depth: float, normal: tuple[float, float, float], velocity: FloatArray, wrench: FloatArray
 ) -> None:
-    """Add the contact force of an underbody `depth` m below the road. It supports a car that lies
-    on its underbody, side or roof, where the wheels give no support."""
+    """Add to `wrench` the contact force of an underbody that is `depth` m below the road with the
+    unit normal `normal`. It supports a car that lies on its underbody, side or roof, where the
+    wheels give no support."""
     if depth > 0.0:
         nx, ny, nz = normal
         closing = -(velocity[0] * nx + velocity[1] * ny + velocity[2] * nz)
@@ -174,7 +178,7 @@ def add_underbody_contact(
 def accelerate(
     p: Any, axes: FloatArray, wrench: FloatArray, dt: float, velocity: FloatArray
 ) -> None:
-    """Add to `velocity` (6,), linear and angular, its change under `wrench` (6,) over `dt` s."""
+    """Add to `velocity` its change under `wrench` over `dt` s, without gyroscopic terms."""
     for i in range(3):
         velocity[i] += dt * wrench[i] / p.total_mass
     for i in range(3):
@@ -194,12 +198,12 @@ def compute_forces(
     command: FloatArray,
     wrench: FloatArray,
 ) -> None:
-    """Compute the forces of one 200 Hz step. Updates `memory` and fills `wrench` (6,), the (force,
-    torque) on the body at its centre of gravity in the world frame, including gravity.
+    """Compute the forces of one 200 Hz step. Updates `memory` (8,) and fills `wrench`, which
+    includes gravity, at the centre of gravity.
 
-    The forces are those at the velocity half a step ahead (midpoint rule). Tyres are stiff for 200
-    Hz: with the current velocity, yaw would settle as if the car had 15 % less inertia. params:
-    `CarParameters.packed()`; command: steer, throttle, brake in their ranges, and gear.
+    The forces are computed with the velocity half a step ahead (midpoint rule). Tyres are stiff for
+    200 Hz: with the current velocity, yaw would settle as if the car had 15 % less inertia. params:
+    `CarParameters.packed()`; motion (13,): see MOTION; command (4,): steer, throttle, brake, gear.
     """
     work = make_work()
     fill_axes(motion[3:7], work[0])
@@ -220,8 +224,9 @@ def compute_forces_at(
     command: FloatArray,
     work: Work,
 ) -> None:
-    """Compute the same as `compute_forces`, for a car whose position `at` (see `locate`) and axes
-    in `work` are already computed; the wrench is written to `work`."""
+    """Compute the forces of one 200 Hz step: updates `memory` (8,) and fills the wrench in `work`.
+    The body axes in `work` and the track coordinates `at` (piece index, s, to_middle) of the car
+    must be computed before; see `compute_forces` for the other arguments."""
     axes, wheels, slip_gain, velocity, turned, wrench = work
     spin = memory[SPIN : SPIN + 4]
     piece, s, d = at

@@ -21,9 +21,9 @@ def gear_ratio(p: Any, gear: int) -> float:
 def engine_torque(p: Any, speed: float, throttle: float) -> float:
     """Return the torque (N m) at the crankshaft at `speed` rad/s and `throttle` (0 to 1).
 
-    As in TORCS, it is the full-load torque times (throttle (1 + b) - b), where the engine braking b
-    grows linearly from 0 at idle. It gives the accelerations of recorded TORCS drives to 0.003
-    m/s2.
+    As in TORCS, the torque is the full-load torque times (throttle (1 + b) - b), where the engine
+    braking b grows linearly from 0 at idle. The formula reproduces the accelerations of recorded
+    TORCS drives to 0.003 m/s2.
     """
     rpm = speed * RPM
     place = min(max(rpm / TORQUE_RPM_STEP, 0.0), 9.999)
@@ -36,8 +36,8 @@ def engine_torque(p: Any, speed: float, throttle: float) -> float:
 
 @inlined
 def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
-    """Return the mean speed (rad/s) of the driven wheels, limited to that at the engine speed
-    `top_rpm`.
+    """Return the mean speed `wheel_speed` (rad/s) of the driven wheels, limited to the speed at
+    which the engine turns at `top_rpm`; `ratio` is engine speed / wheel speed.
 
     As in TORCS, the engine turns no faster in gear: the tyres then slip and slow the car.
     """
@@ -47,18 +47,19 @@ def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
 
 @compiled
 def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float:
-    """Return the engine speed (rad/s) after `dt` s in neutral."""
+    """Return the engine speed (rad/s) after `dt` s in neutral, from the engine speed `speed`
+    (rad/s)."""
     faster = speed + dt * engine_torque(p, speed, throttle) / p.engine_inertia
     return float(min(max(faster, p.idle_rpm / RPM), p.top_rpm / RPM))
 
 
 @inlined
 def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, float]:
-    """Return (engine speed, torque, inertia) at the gearbox input shaft, which turns at
-    `shaft_speed` rad/s (rad/s, N m, kg m2).
+    """Return the engine speed (rad/s), and torque (N m) and inertia (kg m2) of the engine at the
+    gearbox input shaft, which turns at `shaft_speed` rad/s.
 
     Below idle speed the clutch slips: the engine idles and transmits its torque, but its inertia
-    does not act on the shaft. Above the limiter the engine gives no torque, neither drive nor
+    does not act on the shaft. Above `limiter_rpm` the engine gives no torque, neither drive nor
     braking, as in TORCS (forces by speed: tests/simulator/vehicle/test_dynamics.py).
     """
     idle = p.idle_rpm / RPM

@@ -16,7 +16,8 @@ from simulator.vehicle.dynamics import DT, accelerate
 @inlined
 def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
     """Return the change of the angular velocity (body frame, rad/s) in one torque-free step of
-    Euler's equations: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015)."""
+    Euler's equations: one Newton step of the implicit rule, as in PyBullet (Catto, GDC 2015).
+    `axes` (3, 3) has the body axes as rows; `motion` (13,): see `dynamics.MOTION`."""
     wx = axes[0, 0] * motion[10] + axes[0, 1] * motion[11] + axes[0, 2] * motion[12]
     wy = axes[1, 0] * motion[10] + axes[1, 1] * motion[11] + axes[1, 2] * motion[12]
     wz = axes[2, 0] * motion[10] + axes[2, 1] * motion[11] + axes[2, 2] * motion[12]
@@ -36,7 +37,8 @@ def gyroscopic_change(p: Any, axes: FloatArray, motion: FloatArray) -> tuple[flo
 
 @inlined
 def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -> None:
-    """Rotate a unit quaternion (x, y, z, w), in place, by a world angular velocity over `dt`."""
+    """Rotate a unit quaternion (x, y, z, w), in place, by the world angular velocity (wx, wy, wz)
+    in rad/s over `dt` s."""
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     half = 0.5 * rate * dt
     # `scale` is sin(half) / rate, without cancellation at rest.
@@ -55,8 +57,8 @@ def rotate(quaternion: FloatArray, wx: float, wy: float, wz: float, dt: float) -
 
 @inlined
 def integrate(p: Any, axes: FloatArray, motion: FloatArray, wrench: FloatArray) -> None:
-    """Move a free body with the `axes` (3, 3) by one physics step under `wrench` (6,), (force,
-    torque). Updates `motion` (13,)."""
+    """Move a free body with the `axes` (3, 3) by one physics step of 1/200 s under `wrench` (6,),
+    (force, torque). Updates `motion` (13,): position, quaternion, velocity, angular velocity."""
     tx, ty, tz = gyroscopic_change(p, axes, motion)
     accelerate(p, axes, wrench, DT, motion[7:13])
     for i in range(3):

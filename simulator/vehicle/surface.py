@@ -31,14 +31,16 @@ from the centre at which the verge begins."""
 
 
 def ground(road: Road) -> Ground:
-    """Return the surface parameters of `road` as a tuple for compiled code."""
+    """Return (grip, rolling factor) of the road, then of the verge, and the distance (m) from the
+    centre at which the verge begins, as a tuple for compiled code."""
     surface = SURFACES[road.track.surface]
     return (surface.grip, surface.rolling, VERGE.grip, VERGE.rolling, road.half_asphalt)
 
 
 @inlined
 def surface_under_wheel(ground: Ground, to_middle: float) -> tuple[float, float]:
-    """Return grip and rolling factor at a lateral offset (m) from the track's centre."""
+    """Return the grip and the rolling factor (see `SurfaceFriction`) at a lateral offset (m) from
+    the track's centre."""
     if abs(to_middle) > ground[4]:
         return ground[2], ground[3]
     return ground[0], ground[1]

@@ -22,7 +22,8 @@ TRACK_STATE_SIZE = 12
 def measure_track_state(
     table: Table, motion: FloatArray, memory: FloatArray, out: FloatArray
 ) -> None:
-    """Fill `out` (TRACK_STATE_SIZE,), the track state of a car; update PIECE in `memory`."""
+    """Fill `out` (12,), the track state of a body with `motion` (13,). The search for the body's
+    piece of the track starts at the piece stored in `memory` (8,), which is updated."""
     piece, s, to_middle = locate(table, motion[0], motion[1], int(memory[PIECE]))
     memory[PIECE] = piece
     curvature = table[piece, CURVATURE]

@@ -1,6 +1,6 @@
 """Tyre force from slip and load, with the friction ellipse. Wheel frame: x forward, y left.
 
-The magic formula and the effect of the load are those of TORCS's car model. `p` is the record
+The magic formula and the effect of the load are the same as in TORCS's car model. `p` is the record
 `CarParameters.packed()[0]`.
 """
 

@@ -1,7 +1,8 @@
 """Contact of the four wheels with the road: geometry, suspension loads and tyre forces.
 
 World frame z up; body frame x forward, y left, z up, origin at the centre of gravity. SI units. `p`
-is the record `CarParameters.packed()[0]`.
+is the record `CarParameters.packed()[0]`. `wheels` (4, 20) has a row per wheel (front left, front
+right, rear left, rear right); `wrench` (6,) is force and torque on the body in the world frame.
 """
 
 import math
@@ -45,8 +46,8 @@ def wheel_angle(p: Any, wheel: int, steer: float) -> float:
 
 @inlined
 def turn_wheels(p: Any, steer: float, turned: FloatArray) -> None:
-    """Fill `turned` (9,): `steer`, and the cosine and sine of each wheel's angle. They are computed
-    only if `steer` has changed, which is seldom."""
+    """Fill `turned` (9,): `steer` (rad), and the cosine and sine of each wheel's angle. Cosines and
+    sines are computed only if `steer` has changed since the last call."""
     if turned[0] == steer:
         return
     turned[0] = steer
@@ -67,9 +68,11 @@ def locate_contacts(
     wheels: FloatArray,
 ) -> None:
     """Fill the entries of `wheels` that do not depend on the body's velocity: contact point,
-    directions, spring force, damper constant and surface.
+    directions, spring force, damper constant and surface. `piece` is the index of the piece at
+    which the search starts.
 
-    axes (3, 3): body axes as rows; turned (9,): see `turn_wheels`.
+    motion (13,): see `dynamics.MOTION`; axes (3, 3): body axes as rows; turned (9,): see
+    `turn_wheels`.
     """
     upright = True
     for wheel in range(4):
@@ -109,8 +112,9 @@ def locate_contacts(
 def set_directions(
     wheels: FloatArray, wheel: int, axes: FloatArray, cos_a: float, sin_a: float
 ) -> None:
-    """Fill a wheel's directions in the road plane, turned to the left of the body's directions by
-    the angle with the cosine `cos_a` and the sine `sin_a`."""
+    """Fill the unit vectors forward and left of a wheel's row, both in the road plane. The wheel is
+    turned to the left of the body's forward axis by the angle with the cosine `cos_a` and the sine
+    `sin_a`."""
     nx, ny, nz = wheels[wheel, NORMAL], wheels[wheel, NORMAL + 1], wheels[wheel, NORMAL + 2]
     fx = axes[0, 0] * cos_a + axes[1, 0] * sin_a
     fy = axes[0, 1] * cos_a + axes[1, 1] * sin_a
@@ -138,7 +142,8 @@ def spring_force(p: Any, front: bool, compression: float, other: float) -> float
 
 @inlined
 def along(wheels: FloatArray, wheel: int, axis: int, vx: float, vy: float, vz: float) -> float:
-    """Return the component of a velocity along a direction (`axis`) of a wheel's row."""
+    """Return the component of the velocity (vx, vy, vz) along one of a wheel's unit vectors; `axis`
+    is the vector's first column in `wheels` (FORWARD, LEFT or NORMAL)."""
     x, y, z = wheels[wheel, axis], wheels[wheel, axis + 1], wheels[wheel, axis + 2]
     return float(vx * x + vy * y + vz * z)
 
@@ -146,7 +151,7 @@ def along(wheels: FloatArray, wheel: int, axis: int, vx: float, vy: float, vz: f
 @inlined
 def update_loads(p: Any, velocity: FloatArray, wheels: FloatArray) -> None:
     """Fill the entries of `wheels` that depend on the body's `velocity` (6,), linear and angular:
-    speeds of the contact point, load, largest tyre force."""
+    speeds of the contact point (m/s), load (N), largest tyre force (N)."""
     for wheel in range(4):
         x, y, z = wheels[wheel, ARM], wheels[wheel, ARM + 1], wheels[wheel, ARM + 2]
         vx = velocity[0] + velocity[4] * z - velocity[5] * y
@@ -177,7 +182,8 @@ def tyre_slip_gains(p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: Flo
 def add_tyre_forces(
     p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: FloatArray, wrench: FloatArray
 ) -> None:
-    """Add the forces and torques of the road on the four wheels to `wrench` (6,)."""
+    """Add the forces and torques of the road on the four wheels to `wrench`. spin (4,): wheel
+    speeds (rad/s); slip_gain (4,): tyre force per m/s of slip speed (N s/m)."""
     for wheel in range(4):
         speed, load = wheels[wheel, ALONG], wheels[wheel, LOAD]
         resistance = p.rolling_resistance * wheels[wheel, ROLLING] * load
@@ -199,7 +205,8 @@ def add_tyre_forces(
 def component(
     wheels: FloatArray, wheel: int, axis: int, forward: float, leftward: float, load: float
 ) -> float:
-    """Return the world-frame component `axis` (N) of a force given in a wheel's directions."""
+    """Return the component along world axis `axis` (0 to 2) of the force on a wheel, given by its
+    parts (N) `forward`, `leftward` and, along the road normal, `load`."""
     ahead = wheels[wheel, FORWARD + axis] * forward
     return float(
         ahead + wheels[wheel, LEFT + axis] * leftward + wheels[wheel, NORMAL + axis] * load
