@@ -39,7 +39,7 @@ class WatchConfig:
 
 @options_of(WatchConfig)
 def watch(config: WatchConfig) -> None:
-    """Watch a live drive in the browser, and take the wheel with the arrow keys.
+    """Watch a live drive in the browser, and drive the car with the arrow keys.
 
     Shows several camera views, the plan of the track and the sensors. The first line on stderr is
     the address; this machine needs no display. Ctrl-C ends it.

@@ -5,7 +5,8 @@ from simulator.world.world import World
 
 
 class Score:
-    """Sums the reward over an episode. If the time decreases, a new episode has begun."""
+    """Sums the reward over an episode. If the simulated time of a counted state is less than
+    before, a new episode has begun."""
 
     def __init__(self) -> None:
         self.episode = 0

@@ -30,7 +30,8 @@ class Snapshot:
 
 @dataclass(eq=False)
 class Browser:
-    """One connected page, and what was sent to it."""
+    """One connected page: the view that it shows, and the messages sent to it and answered by
+    it."""
 
     view: str
     changed: asyncio.Event = field(default_factory=asyncio.Event)
@@ -57,7 +58,9 @@ class Hub:
     # Called by the drive.
 
     def publish(self, number: int, scene: str, state: str, pictures: dict[str, bytes]) -> None:
-        """Publish a state; `pictures` are the JPEGs of the views rendered for it."""
+        """Publish a state to all browsers. `number` counts the states, `scene` and `state` are JSON
+        messages (see `messages`), and `pictures` are the JPEGs, by view, rendered for this
+        state."""
         with self._lock:
             before = self.latest
             kept = before.pictures if before is not None and before.scene is scene else {}
@@ -103,7 +106,8 @@ class Hub:
             self._left.append(browser)
 
     def submit(self, browser: Browser, request: BrowserRequest) -> None:
-        """Queue a browser's request for the drive; beyond MAX_REQUESTS the oldest is removed."""
+        """Queue a browser's request for the drive. If there are more than MAX_REQUESTS, the oldest
+        request is removed."""
         with self._lock:
             self._requests.append((browser, request))
             del self._requests[:-MAX_REQUESTS]

@@ -19,7 +19,8 @@ FORWARD, BACK, COAST = 3.0, -7.0, -0.6  # m/s2
 
 
 class Keyboard:
-    """Converts the keys held down into smooth commands, at any speed."""
+    """Converts the keys held down into smooth commands. Steering is reduced at high speed, so that
+    a held key causes at most 6 m/s2 of lateral acceleration."""
 
     def __init__(
         self, road: Road, frequency_hz: int, clock: Callable[[], float] = time.monotonic
@@ -39,7 +40,8 @@ class Keyboard:
         self._pedals.reset()
 
     def hold(self, keys: frozenset[str]) -> None:
-        """Set the keys that are held down."""
+        """Set the keys that are held down. They count as released after 0.7 s, unless this is
+        called again."""
         self._keys, self._until = keys, self._clock() + HELD_S
 
     def command(self, state: CarState) -> Command:

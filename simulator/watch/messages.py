@@ -1,5 +1,6 @@
-"""JSON messages to a browser: the scene once, the state with every image. SI units unless a name
-states another unit; angles counter-clockwise, except `angle`: track tangent minus yaw."""
+"""JSON messages to a browser: the scene message is sent once per road, the state message with every
+image. Values are in SI units unless a name states another unit. Angles are counter-clockwise; only
+`angle` is track tangent minus yaw."""
 
 import json
 import math

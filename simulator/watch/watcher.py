@@ -38,10 +38,10 @@ class Perceived:
 class Watcher:
     """Shows the world given to `update` in the browser, at the address `url`.
 
-    Without a browser an update costs microseconds; with browsers, at most 20 pictures per second
-    are drawn. `speed` limits the drive to this multiple of real time; None sets no limit. `seed`
-    determines the scenery. Only the thread that steps the environment may use it. Raises UserError
-    if the port is in use.
+    Without a connected browser an update costs microseconds; with browsers, at most 20 pictures per
+    second are drawn for each view. `speed` limits the drive to this multiple of real time; None
+    sets no limit. `seed` determines the scenery. Only the thread that steps the environment may use
+    the Watcher. Raises UserError if the port is in use.
     """
 
     def __init__(

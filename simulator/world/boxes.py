@@ -1,6 +1,6 @@
 """Boxes around cars and in walls, and a test whether two of them overlap, in compiled code.
 
-A box is an array (BOX,): centre (m), its three axes as rows of unit vectors, half extents along the
+A box is an array (15,): centre (m), its three axes as rows of unit vectors, half extents along the
 axes (m). World frame, z up. `p` is the record `CarParameters.packed()[0]`.
 """
 
@@ -34,7 +34,8 @@ def box_radius(p: Any) -> float:
 
 @compiled
 def fill_car_box(p: Any, motion: FloatArray, box: FloatArray) -> None:
-    """Fill the `box` (BOX,) of a car with the parameters `p` and the motion (13,)."""
+    """Fill `box` (15,) with the box of a car with the parameters `p` and `motion` (13,): position,
+    quaternion (x, y, z, w), velocity, angular velocity."""
     half, above = box_height(p.height, p.cg_height)
     axes = rotation(motion[3:7])
     for i in range(3):
@@ -46,7 +47,8 @@ def fill_car_box(p: Any, motion: FloatArray, box: FloatArray) -> None:
 
 @compiled
 def boxes_overlap(a: FloatArray, b: FloatArray, margin: float) -> bool:
-    """Return whether the gap between two boxes is at most `margin` m along every separating axis.
+    """Return whether the gap between the boxes `a` and `b` (15,) is at most `margin` m along every
+    separating axis.
 
     Method: the separating-axis theorem for oriented boxes (Gottschalk et al., OBBTree, SIGGRAPH
     1996). With a margin of 0 the boxes overlap or touch.

@@ -71,7 +71,8 @@ class ContactPhysics:
         share: float,
         dt: float,
     ) -> Collision | None:
-        """Advance the ego car (`motion`, `memory`, in place) and nearby bodies by one physics step.
+        """Advance the ego car (`motion` (13,), `memory` (8,), in place) and nearby bodies by one
+        physics step with `controls` (4,): steer, throttle, brake, gear.
 
         others (n, 6) and move (n, 6): ground poses of the traffic at the start of the control step
         of `dt` s, and their change over it; share: fraction of the control step already done.

@@ -1,6 +1,7 @@
 """The control step of cars that touch nothing, in compiled code, for the rows of a `fleet`.
 
-A car that touches something stops at that physics step; `World.complete` then moves it.
+If a car touches something, this code moves it only up to that physics step. `World.complete`
+computes the rest of its control step.
 """
 
 from runtime.jit import borrowed, compiled, compiled_for_threads
@@ -35,7 +36,8 @@ from simulator.world.free_motion import advance_free
 
 @compiled
 def lend(fleet: Arrays) -> Arrays:
-    """Return the same arrays without reference counting (`runtime.jit.borrowed`)."""
+    """Return the fleet's arrays without reference counting, which would slow down each view of them
+    (see `runtime.jit.borrowed`)."""
     cars, params, other, tables, left, right, roads, others, move = fleet
     return (
         borrowed(cars),
@@ -52,7 +54,8 @@ def lend(fleet: Arrays) -> Arrays:
 
 @compiled
 def lend_work(work: Work) -> Work:
-    """Return the same arrays without reference counting (`runtime.jit.borrowed`)."""
+    """Return the work arrays without reference counting, which would slow down each view of them
+    (see `runtime.jit.borrowed`)."""
     axes, wheels, slip_gain, velocity, turned, wrench = work
     return (
         borrowed(axes),
@@ -66,8 +69,10 @@ def lend_work(work: Work) -> Work:
 
 @compiled
 def advance_car(number: int, fleet: Arrays, steps: int, work: Work) -> bool:
-    """Advance car `number` by a control step of `steps` physics steps, until it touches something.
-    Cars that are SKIPPED do not move. Returns whether the control step is complete; sets DONE."""
+    """Advance car `number` by a control step of `steps` physics steps, or until the car touches
+    something. Stores the number of physics steps done in the car's column DONE. Returns whether all
+    are done. A car whose column SKIPPED is not 0 is not moved, because it drives among moving
+    wrecks."""
     cars, params, other, tables, left, right, roads, others, move = fleet
     car = cars[number]
     if car[SKIPPED] != 0.0:
@@ -104,8 +109,8 @@ def advance_car(number: int, fleet: Arrays, steps: int, work: Work) -> bool:
 
 @compiled
 def measure_car(table: Table, car: FloatArray) -> None:
-    """Measure the track state of a car's row and count its laps. Crossing the line adds a lap;
-    crossing it backwards subtracts one."""
+    """Update the track state and the number of laps in `car`, a row (48,) of the fleet. Crossing
+    the start line adds a lap; crossing the line backwards subtracts one."""
     track = car[TRACK_AT : TRACK_AT + TRACK_STATE_SIZE]
     before = track[TRACK_S]
     measure_track_state(

@@ -37,10 +37,12 @@ def touches(
 ) -> bool:
     """Return whether the ego car's box is within `margin` m of a wall or a traffic car.
 
-    params, other: `CarParameters.packed()` of the ego car and of a traffic car; at: the ego car's
-    position (see `locate`); others (n, 6): ground poses of the traffic at the start of the control
-    step of `dt` s; move (n, 6): their change over it; share: fraction of the control step already
-    done; radius: radius of the car's box plus the margin.
+    `params` and `other` are the `CarParameters.packed()` of the ego car and of a traffic car,
+    `motion` (13,) is the ego car's motion and `at` its track coordinates (piece index, s,
+    to_middle). `others` (n, 6) are the ground poses of the traffic at the start of the control step
+    of `dt` s, and `move` (n, 6) is their change over the step, of which the fraction `share` is
+    done. `radius` (m) is the largest distance of a point of the car's box from its centre of
+    gravity, plus the margin.
     """
     _, s, d = at
     beside_wall = abs(d) > walls[0] - radius
@@ -84,10 +86,12 @@ def advance_free(
     margin: float,
     work: Work,
 ) -> int:
-    """Advance the ego car from physics step `done` of `steps` until it touches something.
+    """Advance the ego car from physics step `done` of `steps` until it touches something; arguments
+    as in `touches` and `dynamics.compute_forces`. Returns the number of physics steps done at the
+    end.
 
-    `margin` (m) as in `touches` applies to the first step; it is 0 for later steps. Returns the
-    number of steps then done. `work` is memory for the steps.
+    In the first step, a gap of at most `margin` m counts as touching; in later steps only an
+    overlap does. `work` is memory for the steps.
     """
     p, axes, wrench = params[0], work[0], work[5]
     forget_turn(work)

@@ -41,7 +41,8 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """Amount per second; 0 if there are too few data."""
+        """Amount per second; 0 if fewer than two amounts were added, or if the window began over 3
+        s ago."""
         if len(self._marks) < 2:
             return 0.0
         first, before = self._marks[0]

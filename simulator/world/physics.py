@@ -44,8 +44,8 @@ class PhysicsClient:
         self.walls: list[int] = []
 
     def rebuild(self, cars: Sequence[CarParameters]) -> None:
-        """Remove all bodies and create these cars, so that no state of an earlier episode (such as
-        cached contacts) remains."""
+        """Remove all bodies and create a body for each of `cars`, so that no state of an earlier
+        episode (such as cached contacts) remains."""
         client = self._client
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
@@ -81,14 +81,16 @@ class PhysicsClient:
         pybullet.resetBasePositionAndOrientation(body, place, turn, physicsClientId=self._client)
 
     def park(self, body: int) -> None:
-        """Move a body out of reach of all other bodies; each body has its own position there."""
+        """Move a body far below the road, out of reach of all other bodies. Each body has its own
+        parking place."""
         place, still = [20.0 * body, 0.0, -PARKING_DEPTH_M], [0.0, 0.0, 0.0]
         client = self._client
         pybullet.resetBasePositionAndOrientation(body, place, [0, 0, 0, 1], physicsClientId=client)
         pybullet.resetBaseVelocity(body, still, still, physicsClientId=client)
 
     def apply_wrench(self, body: int, wrench: NDArray[np.float64], motion: Motion) -> None:
-        """Apply (force, torque) (6,) at the body's centre of gravity in the next step."""
+        """Apply `wrench` (6,), force (N) and torque (N m) in the world frame, in the next step. The
+        force acts at the centre of gravity, the first three values of `motion` (13,)."""
         force, client, world = wrench.tolist(), self._client, pybullet.WORLD_FRAME
         at = motion[:3].tolist()
         pybullet.applyExternalForce(body, -1, force[:3], at, world, physicsClientId=client)

@@ -79,8 +79,9 @@ class Walls:
 def panel_beside(
     table: Table, walls: WallTable, s: float, to_middle: float, reach: float, row: FloatArray
 ) -> bool:
-    """Fill `row` (x, y, z, yaw of the panel's centre; x, y of its face) for a car at (s, to_middle)
-    m. Returns False if there is no wall within `reach` m."""
+    """Fill `row` (6,) with x, y, z, yaw of the centre of the panel beside a car at (s, to_middle)
+    m, and x, y of the middle of the panel's side that faces the road. Returns False, without
+    filling `row`, if there is no wall within `reach` m."""
     offset = walls[0]
     if not offset - reach < abs(to_middle) < offset:
         return False
@@ -102,8 +103,8 @@ def panel_beside(
 def fill_panel_box(
     table: Table, walls: WallTable, s: float, to_middle: float, reach: float, box: FloatArray
 ) -> bool:
-    """Fill the `box` (`boxes.BOX`,) of the panel beside a car at (s, to_middle) m. Returns False if
-    there is no wall within `reach` m."""
+    """Fill `box` (15,) (see `boxes`) with the box of the panel beside a car at (s, to_middle) m.
+    Returns False, without filling `box`, if there is no wall within `reach` m."""
     row = np.empty(_ROW)
     if not panel_beside(table, walls, s, to_middle, reach, row):
         return False
@@ -146,8 +147,9 @@ def covered_elsewhere(
     length: float,
     edge: float,
 ) -> NDArray[np.bool_]:
-    """Return whether each of `foot` (N, 3) at `stations` (N,) lies within `edge` m of a point of
-    the centre line `centre` (M, 3), spaced _CENTRE_STEP_M, that is far away along s."""
+    """Return for each wall foot `foot` (N, 3) at s = `stations` (N,) whether it lies on another
+    part of the track: within `edge` m of a point of the centre line `centre` (M, 3), every 2 m,
+    that is more than 60 m away along the lap of `length` m and less than 4 m higher or lower."""
     covered = np.zeros(foot.shape[0], dtype=np.bool_)
     for i in range(foot.shape[0]):
         k = 0

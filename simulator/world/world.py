@@ -155,7 +155,8 @@ class World:
         return self.state
 
     def step(self, command: Command) -> CarState:
-        """Apply `command` for one control step. Raises UserError for a value out of its range."""
+        """Return the state after a control step with `command`. Raises UserError for a bad
+        command."""
         if not self._started:
             return self.state  # raises
         _fill_controls(command, self._controls)
@@ -167,7 +168,7 @@ class World:
         return self.state
 
     def begin(self) -> None:
-        """Begin a control step: move the traffic, and mark a car among moving wrecks as SKIPPED."""
+        """Begin a control step: move the traffic, and set SKIPPED if a wreck is moving."""
         self._row[TOUCHED] = self._row[DONE] = self._row[SKIPPED] = 0.0
         if self._traffic_count:
             self._advance_traffic(self.state)
@@ -313,7 +314,7 @@ class World:
 def check_place(
     road: Road, s: float = 0.0, to_middle: float = 0.0, angle: float = 0.0, speed: float = 0.0
 ) -> None:
-    """Raises UserError unless a drive can start there; arguments as in `World.reset`."""
+    """Raises UserError unless `World.reset` accepts these start values (m, m, rad, m/s)."""
     for name, value in (("s", s), ("to_middle", to_middle), ("angle", angle)):
         if not math.isfinite(value):
             raise UserError(f"reset got {name} = {value}; give a finite number")
