@@ -130,7 +130,8 @@ class CameraParameters:
 
     def project(self, points: "ArrayLike") -> "NDArray[np.float64]":
         """Project points (N, 3) in m in the car's frame to pixels (N, 2). Pixels are NaN for points
-        behind the camera and for points beyond the angle at which the lens model folds."""
+        behind the camera and for points at larger angles from the axis than the lens model covers
+        (see `lens`)."""
         import numpy as np
 
         from trackfeatures.lens import project
@@ -179,7 +180,8 @@ class CameraParameters:
         return replace(self, width=width, height=height, matrix=matrix)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields by name as they are written to files; `stored` omits some defaults."""
+        """Return the fields by name as they are written to files. Fields that older files do not
+        contain are omitted if they have their default value (see `stored`)."""
         return asdict(self, dict_factory=stored)
 
     def __str__(self) -> str:
@@ -201,9 +203,9 @@ _LATER = {field.name: field.default for field in fields(CameraParameters)[7:]}
 
 
 def stored(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a dict for `dataclasses.asdict`: it omits the fields of `_LATER` that have their
-    default value, in cameras at any depth. So a camera that older files can describe keeps its
-    hash."""
+    """Return `pairs` as a dict; use it as the `dict_factory` of `dataclasses.asdict`. In cameras,
+    fields that older files do not contain (`_LATER`) are omitted if they have their default value,
+    so that the hash of a camera from an older file stays the same."""
     values = dict(pairs)
     if tuple(values) == _NAMES:
         return {k: v for k, v in values.items() if k not in _LATER or v != _LATER[k]}

@@ -1,8 +1,8 @@
 """Encodes features in m and rad as the six training targets of the network, and decodes them.
 
 `y = 0.1 + 0.8 (x - lo) / (hi - lo)`, clipped to [0, 1]; the columns are in the order of `TARGETS`.
-An absent distance is NaN in m; its code is that of the end of its range that is farther from the
-car. An unknown distance is infinite in m; its code is NaN.
+An absent distance is NaN in m and is encoded as the end of its range that is farther from the car.
+An unknown distance is infinite in m and is encoded as NaN.
 """
 
 import math

@@ -109,7 +109,7 @@ def lane_offset(
     visible.
 
     The pair `ml`, `mr` has priority. Without this pair, the lane on the car's side of the marking
-    `m` is used; outside the road, the only lane next to `m`.
+    `m` is used. Outside the road there is no lane on this side, so the lane beyond `m` is used.
     """
     if ml is not None and mr is not None:
         return (ml + mr) / 2

@@ -13,7 +13,8 @@ class DefinitionsMismatch(UserError):
 
 
 def require_version(found: str, what: str) -> None:
-    """Raises DefinitionsMismatch unless `what` was made with this version of the definitions."""
+    """Raises DefinitionsMismatch unless `found`, the version of the definitions with which `what`
+    was made, is this program's version."""
     if found != VERSION:
         raise DefinitionsMismatch(
             f"{what} was made with version {found!r} of the track-feature definitions, but this "

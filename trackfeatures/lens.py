@@ -1,9 +1,9 @@
 """Projection through a lens and its inverse, in the camera's frame: x right, y down, z ahead.
 
 Distortion is OpenCV's pinhole model (k1, k2, p1, p2, k3 to k6: calib3d's documentation; Brown 1966)
-or OpenCV's fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). Beyond
-the angle at which the distorted radius stops growing, a model folds; rays beyond it are not
-projected.
+or OpenCV's fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). A model
+is used only up to the angle at which the distorted radius stops growing; rays at larger angles are
+not projected.
 """
 
 from functools import lru_cache
@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 
 
 def mount_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """Return the rotation (3, 3) from the car's to the camera's frame, for Rz(yaw) Ry(pitch)
-    Rx(roll)."""
+    """Return the rotation (3, 3) from the car's to the camera's frame, for a camera turned by
+    Rz(yaw) Ry(pitch) Rx(roll) relative to the car; angles in rad."""
     cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
     ahead = (cy * cp, sy * cp, -sp)
     left = (cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr)
@@ -36,7 +36,8 @@ def mount_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
 
 
 def project(camera: "CameraParameters", points: FloatArray) -> FloatArray:
-    """Project points (N, 3) in the camera's frame to pixels (N, 2); NaN outside the lens model."""
+    """Project points (N, 3) in the camera's frame to pixels (N, 2). Pixels are NaN for points
+    behind the camera or beyond the angles that the lens model covers."""
     ahead = points[:, 2] > 1e-9
     flat = points[:, :2] / np.where(ahead, points[:, 2], np.nan)[:, None]
     if camera.distortion != "none":
@@ -50,7 +51,8 @@ def project(camera: "CameraParameters", points: FloatArray) -> FloatArray:
 
 
 def rays(camera: "CameraParameters", pixels: ArrayLike) -> FloatArray:
-    """Return ray directions (N, 3), z = 1, of pixels (N, 2); NaN where no ray maps to a pixel."""
+    """Return the ray directions (N, 3), with z = 1, of pixels (N, 2) in the camera's frame; NaN
+    where no ray maps to a pixel."""
     k = camera.intrinsics()
     flat = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - k[:2, 2]) / (k[0, 0], k[1, 1])
     if camera.distortion != "none":
@@ -144,7 +146,9 @@ def _angle_polynomial(coefficients: tuple[float, ...]) -> list[float]:
 
 @lru_cache(maxsize=64)
 def angle_limit(kind: str, coefficients: tuple[float, ...]) -> float:
-    """Return the angle from the optical axis in rad at which the distorted radius stops growing."""
+    """Return the angle from the optical axis in rad at which the distorted radius stops growing.
+    `kind` is the distortion model ("opencv" or "fisheye"), `coefficients` are the coefficients of
+    this model."""
     if kind == "fisheye":
         limits = _positive_roots(np.polyder(_angle_polynomial(coefficients)))
         return min([*limits, MAX_ANGLE_RAD])

@@ -118,7 +118,7 @@ def in_lane_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float, float] | tuple[None, None]:
     """Return `ml` and `mr` (m), or (None, None) if the in-lane system is inactive. The simulator
-    compiles this function and `on_marking_distances`."""
+    also compiles this function."""
     lane = lane_index(to_middle, lanes, lane_width_m)
     beside = to_middle - lane_centre(lane, lanes, lane_width_m)
     ml = beside - lane_width_m / 2 - offsets[lane][RIGHT_LANE]
@@ -130,7 +130,8 @@ def in_lane_distances(
 def on_marking_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float | None, float | None, float | None]:
-    """Return `l`, `m` and `r` (m); None for an absent one."""
+    """Return `l`, `m` and `r` (m). A distance to a marking that does not exist is None; all are
+    None if the on-marking system is inactive."""
     # Markings are numbered from 0 (leftmost) to `lanes` (rightmost).
     nearest = min(max(round(lanes / 2 - to_middle / lane_width_m), 0), lanes)
     place = to_middle - lane_width_m * (lanes / 2 - nearest)
@@ -145,7 +146,8 @@ def on_marking_distances(
 
 
 def localise(distances: ArrayLike) -> NDArray[np.float64]:
-    """Return `lane_offset` (N,) in m of distances (N, 5) in m (NaN: absent); NaN without a lane."""
+    """Return the offsets (N,) in m from the centre of the nearest lane, left positive, of
+    `distances` (N, 5) in m (NaN: absent); NaN if no lane is visible."""
     rows = np.atleast_2d(np.asarray(distances, dtype=np.float64)).tolist()
     present = ((None if math.isnan(d) else d for d in row) for row in rows)
     offsets = (lane_offset(*row) for row in present)

@@ -18,12 +18,14 @@ class BadName(UserError, ValueError):
 
 
 def is_name(value: object) -> bool:
-    """Return whether `value` is text of ASCII letters, digits, `.`, `_`, `-`, not `.` or `..`."""
+    """Return whether `value` is a text of 1 to 128 ASCII letters, digits, `.`, `_` or `-`, but not
+    `.` or `..`."""
     return isinstance(value, str) and NAME.fullmatch(value) is not None and value not in (".", "..")
 
 
 def require_name(value: object, what: str) -> str:
-    """Return `value` if it is a name, else raise BadName. `what` names it in the message."""
+    """Return `value` if `is_name` accepts it, else raise BadName. `what` describes the value in the
+    message."""
     if not is_name(value):
         raise BadName(
             f"the {what} is {str(value)[:80]!r}; expected a name of letters, digits, '.', '_' and "
@@ -33,6 +35,7 @@ def require_name(value: object, what: str) -> str:
 
 
 def to_name(text: str) -> str:
-    """Return `text` with `-` in place of every forbidden character, cut to `MAX_LENGTH`."""
+    """Return `text` with `-` in place of every forbidden character, cut to 128 characters;
+    "unnamed" if the result is empty, `.` or `..`."""
     found = OTHER.sub("-", text)[:MAX_LENGTH]
     return found if is_name(found) else "unnamed"
