@@ -31,7 +31,7 @@ class CameraParameters:
     images of its training camera, or images warped to that camera's view.
 
     The camera's rotation relative to the car is Rz(yaw) Ry(pitch) Rx(roll). Raises CameraError for
-    an impossible lens, for example a vertical field of view outside `FOV_LIMITS_DEG`.
+    an impossible lens, for example a vertical field of view outside 1 to 150 deg.
     """
 
     width: int = 280

@@ -69,7 +69,8 @@ def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
 
 
 def classify_heading(curvature: float, curvature_ahead: float) -> RoadClass:
-    """Return the class of a road with this `curvature` at the car and `curvature_ahead` (1/m)."""
+    """Return the class of the road from the `curvature` at the car and the `curvature_ahead`, 20 m
+    ahead of the car (1/m, left positive)."""
     for kappa in (curvature, curvature_ahead):
         if abs(kappa) >= BEND_CURVATURE:
             return RoadClass.LEFT if kappa > 0 else RoadClass.RIGHT

@@ -45,7 +45,7 @@ class Message:
 
 
 def write_state(record: Any, state: CarState) -> None:
-    """Write the car's state into a STATE record."""
+    """Write the car's state into `record`, a record of the block STATE."""
     for name in _PLAIN:
         record[name] = getattr(state, name)
     record["collision"] = Collision[(state.collision or "none").upper()]
@@ -53,7 +53,7 @@ def write_state(record: Any, state: CarState) -> None:
 
 
 def read_state(values: Values) -> CarState:
-    """Read the car's state from the values of a STATE record."""
+    """Return the car's state from `values`, the fields by name of a STATE record."""
     touched = Collision(values["collision"])
     return CarState(
         **{name: values[name] for name in _PLAIN if name != "wheel_spin"},
@@ -65,7 +65,8 @@ def read_state(values: Values) -> CarState:
 
 
 def write_features(record: Any, features: tf.TrackFeatures) -> None:
-    """Write the track features into a STATE record; absent distances are NaN."""
+    """Write the track features into `record`, a record of the block STATE. Absent distances are
+    NaN."""
     for name, value in features.distances.items():
         record[name] = math.nan if value is None else value
     centre = features.to_lane_centre
@@ -74,7 +75,7 @@ def write_features(record: Any, features: tf.TrackFeatures) -> None:
 
 
 def read_features(values: Values) -> tf.TrackFeatures:
-    """Read the track features from the values of a STATE record."""
+    """Return the track features from `values`, the fields by name of a STATE record."""
     return tf.TrackFeatures(
         **{name: None if math.isnan(values[name]) else values[name] for name in tf.MARKINGS},
         angle=values["angle"],
@@ -108,14 +109,14 @@ def read_message(record: Any, image: NDArray[np.uint8] | None) -> Message:
 
 
 def write_command(record: Any, command: Command) -> None:
-    """Write a step request with `command` into a COMMAND record."""
+    """Write a step request with `command` into `record`, a record of the block COMMAND."""
     record["request"] = Request.STEP
     record["steer"], record["throttle"] = command.steer, command.throttle
     record["brake"], record["gear"] = command.brake, command.gear
 
 
 def read_command(record: Any) -> Command:
-    """Read the car's command from a COMMAND record."""
+    """Return the car's command in `record`, a record of the block COMMAND."""
     return Command(
         steer=float(record["steer"]),
         throttle=float(record["throttle"]),

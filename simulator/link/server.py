@@ -1,5 +1,5 @@
-"""The loop of a link server: reads commands, answers them with a Simulation, and observes its
-client.
+"""The loop of a link server: reads commands, answers them with a Simulation, and checks that its
+client is alive.
 
 In lock-step mode the server waits for a command before each control step. In real-time mode it
 steps by the wall clock and repeats the last command, as long as an episode runs.

@@ -111,8 +111,8 @@ def picture_sensor(
 
 
 def sensors_of(chosen: Iterable[str | Sensor]) -> tuple[Sensor, ...]:
-    """Replace names in `chosen` by the sensors of these names in STANDARD. Raises UserError for an
-    unknown name."""
+    """Return `chosen` with each name replaced by the sensor of this name in STANDARD. Raises
+    UserError for an unknown name."""
     return tuple(sensor if isinstance(sensor, Sensor) else _named(sensor) for sensor in chosen)
 
 

@@ -146,7 +146,8 @@ class Track:
         return self._table
 
     def at(self, s: ArrayLike, y: ArrayLike = 0.0) -> TrackPose:
-        """Return the road plane's points at (s, y) in m; both broadcast, s wraps round the lap."""
+        """Return the points of the road plane at the distances `s` and the offsets `y` (m), which
+        are broadcast to one shape; s wraps round the lap."""
         distance, offset = np.broadcast_arrays(
             np.asarray(s, dtype=np.float64), np.asarray(y, dtype=np.float64)
         )
@@ -180,7 +181,8 @@ class Track:
         return float(s), float(to_middle)
 
     def heading(self, s: float) -> float:
-        """Return the direction of the tangent at s, rad in (-pi, pi]."""
+        """Return the direction of the centre line's tangent at s, in the world frame, rad in (-pi,
+        pi]."""
         _, _, _, heading, _ = piece_table.pose_at(self.arrays(), float(s))
         return float(wrap_angle(np.float64(heading)))
 

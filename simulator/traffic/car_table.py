@@ -217,8 +217,9 @@ def centre_line_advance(table: FloatArray, s: float, y: float, distance: float) 
 
 @compiled
 def move_car(cars: FloatArray, i: int, advance_m: float, dt: float, length: float) -> None:
-    """Advance car `i` along its lane by `advance_m`. The lateral motion of a lane change depends on
-    the distance driven, so a car at rest does not move sideways."""
+    """Advance car `i` (a row of `cars` (n, 10)) along its lane by `advance_m` within `dt` s;
+    `length` (m) is the length of the lap. The lateral motion of a lane change depends on the
+    distance driven, so a car at rest does not move sideways."""
     cars[i, S] = (cars[i, S] + advance_m) % length
     if cars[i, CHANGE_PROGRESS] >= 1.0:
         cars[i, COOLDOWN_S] = max(cars[i, COOLDOWN_S] - dt, 0.0)

@@ -23,8 +23,7 @@ def idm_acceleration(gap: float, speed: float, lead_speed: float, desired_speed:
     """Return the acceleration (m/s2) of a driver `gap` m (bumper to bumper) behind a leader.
 
     `gap` is math.inf if there is no leader. All speeds are in m/s. Unlike in Treiber's model,
-    braking to the desired speed is limited to COMFORTABLE_BRAKING; only a leader can cause harder
-    braking.
+    braking to the desired speed is limited to 2 m/s2; only a leader can cause harder braking.
     """
     free = 1.0 - (speed / max(desired_speed, _MIN_DESIRED_SPEED)) ** 4
     free = max(COMFORTABLE_ACCELERATION * free, -COMFORTABLE_BRAKING)

@@ -38,7 +38,7 @@ class Score:
         return passed
 
     def as_dict(self) -> dict[str, float | int | str | None]:
-        """Return the score's entries of the state message."""
+        """Return the score as entries of the state message, by name."""
         steps = max(self.steps, 1)
         return {
             "episode": self.episode,

@@ -81,7 +81,8 @@ class Hub:
         return len(self._browsers)
 
     def take_requests(self) -> tuple[list[tuple[Browser, BrowserRequest]], list[Browser]]:
-        """Return the requests and the browsers that disconnected since the last call."""
+        """Return the requests that browsers have sent since the last call, each with its browser,
+        and the browsers that have disconnected since then."""
         with self._lock:
             requests, left = self._requests, self._left
             self._requests, self._left = [], []
@@ -106,7 +107,7 @@ class Hub:
             self._left.append(browser)
 
     def submit(self, browser: Browser, request: BrowserRequest) -> None:
-        """Queue a browser's request for the drive. If there are more than MAX_REQUESTS, the oldest
+        """Queue a browser's request for the drive. If more than 256 requests wait, the oldest
         request is removed."""
         with self._lock:
             self._requests.append((browser, request))

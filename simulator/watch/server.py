@@ -130,7 +130,7 @@ class Server:
         )
 
     def start(self) -> None:
-        """Start the thread. Raises UserError if the server does not start within START_S."""
+        """Start the thread. Raises UserError if the server does not start within 10 s."""
         self._thread.start()
         deadline = time.monotonic() + START_S
         while not self._server.started:

@@ -30,7 +30,7 @@ class Perceived:
     """Heading angle: track tangent minus yaw, rad."""
 
     def as_dict(self) -> dict[str, float | None]:
-        """Return the estimate's entries of the state message."""
+        """Return the estimate as entries of the state message, by name."""
         offset = None if self.to_middle is None else round(self.to_middle, 3)
         return {"to_middle": offset, "angle": round(self.angle, 5)}
 

@@ -24,7 +24,7 @@ def check_speed(speed: float) -> None:
 
 
 class Rate:
-    """Measures an amount per second of wall-clock time, over the last WINDOW_S."""
+    """Measures an amount per second of wall-clock time, over the last 1.5 s."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -78,8 +78,8 @@ class Pacer:
         return self._clock() > self._due
 
     def wait(self) -> bool:
-        """Sleep until the next step is due. Returns whether it was late by more than `catch_up_s`;
-        such a delay is not caught up."""
+        """Sleep until the next step is due. Returns True if the step is overdue by more than
+        `catch_up_s`; the steps after it then do not make up the delay."""
         ahead = self._due - self._clock()
         late = ahead < -self._catch_up_s
         if ahead > 0.0:

@@ -79,7 +79,7 @@ def try_read(
     """Copy the message into `local` if it is complete and newer than the sequence number `seen`.
 
     Returns (NOTHING, READ or DAMAGED; sequence number of the message). The function gives up after
-    MAX_TRIES, so it never blocks. After DAMAGED, or if it gives up, the contents of `local` are
+    100 tries, so it never blocks. After DAMAGED, or if it gives up, the contents of `local` are
     undefined.
     """
     for _ in range(MAX_TRIES):
