@@ -93,7 +93,8 @@ class Carriageway:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Carriageway":
         """Return the carriageway whose `dataclasses.asdict` is `values`, also after a round trip
-        through JSON. Raises KeyError, TypeError or ValueError if a field is missing or unknown."""
+        through JSON. Raises KeyError, TypeError or ValueError if a field is unknown or a required
+        field is missing."""
         found: Carriageway = rebuilt(Carriageway, values)
         return found
 

@@ -86,8 +86,8 @@ def rebuilt(kind: Any, value: Any) -> Any:
     """Return the object of type `kind` whose `dataclasses.asdict` is `value`. `value` may have been
     stored as JSON, which turns tuples into lists.
 
-    Raises KeyError, TypeError or ValueError if fields are missing or unknown, or if a tuple has
-    another length. The types of numbers and texts are not checked.
+    Raises KeyError, TypeError or ValueError if a field is unknown, a field without a default is
+    missing, or a tuple has another length. The types of numbers and texts are not checked.
     """
     if is_dataclass(kind):
         hints = get_type_hints(kind)

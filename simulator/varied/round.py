@@ -24,6 +24,7 @@ class VariedRound:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "VariedRound":
         """Return the round whose `dataclasses.asdict` is `values`, also after a round trip through
-        JSON. Raises KeyError, TypeError or ValueError if a field is missing or unknown."""
+        JSON. Raises KeyError, TypeError or ValueError if a field is unknown or a required field is
+        missing."""
         found: VariedRound = rebuilt(VariedRound, values)
         return found

@@ -163,8 +163,8 @@ def add_underbody_contact(
     depth: float, normal: tuple[float, float, float], velocity: FloatArray, wrench: FloatArray
 ) -> None:
     """Add to `wrench` the contact force of an underbody that is `depth` m below the road with the
-    unit normal `normal`. It supports a car that lies on its underbody, side or roof, where the
-    wheels give no support."""
+    unit normal `normal`. The force supports a car that lies on its underbody, side or roof, where
+    the wheels give no support."""
     if depth > 0.0:
         nx, ny, nz = normal
         closing = -(velocity[0] * nx + velocity[1] * ny + velocity[2] * nz)
