@@ -12,7 +12,7 @@ from trackfeatures.errors import UserError
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Parse seeds such as "1,2,3". Raises UserError when one is not a non-negative integer."""
+    """Parse seeds such as "1,2,3". Raises UserError when a part is not a non-negative integer."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdigit() for part in parts):
         raise UserError(f"--seeds {text!r} is not a list of whole numbers; give them as 1,2,3")
@@ -21,7 +21,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class AblationConfig:
-    """One ablation. Only `seeds`, `device` and `threads` can change when it is continued."""
+    """Settings of an ablation. When an interrupted ablation is continued, only `seeds`, `device`
+    and `threads` can differ."""
 
     out: Annotated[Path, Option(help="Folder of the ablation; an existing one is continued.")]
     iterations: Annotated[int, Option(help="Number of training steps of every run.")]

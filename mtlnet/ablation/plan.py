@@ -1,8 +1,10 @@
-"""The paper's ablation: single tasks, the four task weightings MTL 1 to 4, and two other networks.
+"""The paper's ablation: single tasks, the task weightings MTL 1 to 4, DeepDriving and a torchvision
+backbone.
 
-Every row is trained once per seed with equal iterations on the same data, and evaluated on the same
-rounds in float32. A run has an ordinary run folder. Finished runs are kept, so that an interrupted
-ablation continues with the first unfinished run.
+Each row of the table is a network with task weights. It is trained once per seed, with equal
+iterations on the same data, and evaluated on the same rounds in float32. Each training writes a run
+folder, like `mtlnet train`. Finished runs are kept, so that an interrupted ablation continues with
+the first unfinished run.
 """
 
 import json
@@ -38,8 +40,11 @@ TASK_NAMES = ("distance", "angle", "type")
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table: a network with task weights. `paper`: the paper's distance loss, angle
-    loss and accuracy of the class; None where the paper has none."""
+    """One row of the table: a network with task weights `alpha`.
+
+    `paper`: the distance loss, the angle loss and the accuracy of the class (0 to 1) that the paper
+    states for this row; None where the paper states no value.
+    """
 
     name: str
     title: str
@@ -61,10 +66,11 @@ PAPER_ROWS = (
 
 
 def ablation_rows(backbone: str = BACKBONE, only: str = "") -> tuple[Row, ...]:
-    """Return the paper's seven rows, DeepDriving and `backbone`, or only those named in `only`.
+    """Return the rows of the table: the paper's seven rows, a row for DeepDriving, and a row for
+    the network `backbone`.
 
-    `only`: names separated by commas; empty: all rows. Raises UserError for an unknown name, and
-    when `backbone` is not a torchvision backbone.
+    `only`: names of the rows to return, separated by commas; empty: all rows. Raises UserError for
+    an unknown name, and when `backbone` is not a torchvision backbone.
     """
     plan = find_architecture(backbone)
     if not plan.backbone:
@@ -102,7 +108,8 @@ Evaluate = Callable[[Path, AblationConfig], dict[str, Any]]
 
 
 def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
-    """Return all runs, ordered by seed, so that the table is complete after the first seed."""
+    """Return all runs, ordered by seed, so that every row has a result after the runs of the first
+    seed."""
     return [
         Run(row, seed, config.out / "runs" / f"{row.name}-seed{seed}")
         for seed in config.seeds
@@ -111,8 +118,12 @@ def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
 
 
 def require_same_settings(config: AblationConfig, content_hash: str) -> None:
-    """Write the settings of a new folder. Raises UserError when the folder has other settings, or
-    other files. `content_hash` is the hash of the dataset."""
+    """Write the settings to the folder `config.out` if it is new or empty. If it already has
+    settings, raise UserError where they differ from `config` and `content_hash`; also if it holds
+    other files.
+
+    `content_hash`: the hash of the dataset.
+    """
     settings = {**config.shared_settings(), "content_hash": content_hash}
     path = config.out / SETTINGS
     if path.is_file():
@@ -138,8 +149,12 @@ def require_same_settings(config: AblationConfig, content_hash: str) -> None:
 def finish_runs(
     config: AblationConfig, runs: Sequence[Run], train: Train, evaluate: Evaluate
 ) -> Iterator[Run]:
-    """Train and evaluate the unfinished runs one after another. Yields each run when it is
-    finished."""
+    """Train and evaluate the unfinished runs one after another, and yield each run once it is
+    finished.
+
+    `train(config, resumed)` trains or resumes a run; `evaluate(folder, config)` returns the
+    evaluation of a trained run.
+    """
     for run in runs:
         if run.state != "finished":
             _finish(config, run, train, evaluate)
@@ -175,7 +190,8 @@ def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) 
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """Read the evaluation of a finished run; None if it is missing or belongs to other weights."""
+    """Read the evaluation of a finished run; None if it is missing or damaged, or if the run's
+    weights have changed since."""
     if not (folder / EVALUATION).is_file() or not (folder / CARD).is_file():
         return None
     try:
@@ -190,9 +206,11 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table. `task`: index of the measured task in the task weights alpha.
+    """A column of the table. `task`: index, in the task weights alpha, of the task that it
+    measures.
 
-    `path`: the keys that lead to the value in an evaluation; `scale`: factor for the page.
+    `path`: the keys that lead to the value in an evaluation; `scale`: factor by which the HTML page
+    multiplies the value.
     """
 
     name: str
@@ -219,7 +237,8 @@ MAX_CURVE_POINTS = 120
 
 
 def figures(result: Any) -> dict[str, float | None]:
-    """Return the value of each of `COLUMNS` in the evaluation `result`, by the column's name."""
+    """Return the value of each of `COLUMNS`, by its name, from `result`, an evaluation by
+    `mtlnet.evaluation.evaluate`. A value is None where the evaluation has none."""
     return {column.name: reduce(getitem, column.path, result) for column in COLUMNS}
 
 
@@ -252,7 +271,8 @@ def table(rows: Sequence[Row], runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
-    """Return the index of the entry with the best mean in a column; None without any mean."""
+    """Return the index of the entry with the best mean in `column`: the highest accuracy, else the
+    lowest loss or error. None if no entry has a mean."""
     found = [(entry["figures"][column], i) for i, entry in enumerate(entries)]
     means = [(figure["mean"], i) for figure, i in found if figure is not None]
     return (max if column == "accuracy" else min)(means, default=(None, None))[1]
@@ -261,7 +281,8 @@ def best(entries: Sequence[dict[str, Any]], column: str) -> int | None:
 def training_curve(
     runs: Sequence[Run], row: Row, task: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return steps (P,) and training losses (seeds, P) of a task; None without a finished run.
+    """Return steps (P,) and training losses (seeds, P) of a task, with at most 120 points P; None
+    if no run of `row` is finished.
 
     Each point is the mean over an equal share of the logged points, which smooths the curve.
     """

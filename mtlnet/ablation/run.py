@@ -148,8 +148,8 @@ def _plan_with_times(
 def step_seconds(
     config: AblationConfig, network: str, runs: Sequence[Run], dataset: Dataset
 ) -> float:
-    """Return the median seconds per training step, from the finished runs of the network; without
-    one, from `TIMED_STEPS` steps made now."""
+    """Return the median seconds per training step of the finished runs of `network`. If none is
+    finished, two steps are made and timed."""
     speeds = [
         point["images_per_second"]
         for run in runs
@@ -188,8 +188,8 @@ paper does not define its losses exactly."""
 def page(
     config: AblationConfig, entries: Sequence[dict[str, Any]], rows: Sequence[Row], runs: list[Run]
 ) -> str:
-    """Return the HTML page: our losses and the paper's, the errors in metres and radians, and the
-    training curves."""
+    """Return the HTML page. It compares the losses of the finished runs with the paper's losses,
+    and shows the errors in metres and radians and the training curves."""
     return render(
         "mtlnet.ablation",
         "ablation.html",
