@@ -36,13 +36,14 @@ where the picture shows no board."""
 
 
 class NoBoard(UserError):
-    """The pictures do not allow a calibration of the lens."""
+    """Raised when the pictures do not allow a calibration of the lens."""
 
 
 @dataclass(frozen=True)
 class BoardPicture:
     """A picture with its corners found (N, 2) px, their projections by the calibrated lens (N, 2)
-    px, and the root mean square error. A picture that is not used has a `problem` instead."""
+    px, and the root mean square of their distances, `error_px`. For a picture that is not used,
+    `problem` has the reason."""
 
     path: Path
     corners: NDArray[np.float64]
@@ -53,8 +54,8 @@ class BoardPicture:
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """The calibrated lens. `focal_std_px` is the standard deviation of the focal length fy,
-    `error_px` the root mean square error over all used corners."""
+    """The calibrated lens. `focal_std_px` is the standard deviation of the focal length fy, 0 for a
+    fisheye lens; `error_px` is the root mean square error over all used corners."""
 
     camera: CameraParameters
     board: str
@@ -75,8 +76,10 @@ def calibrate_board(
 
     `board`: inner corners of a chessboard, such as "9x6"; "charuco:5x7" for the squares of a
     ChArUco board, optionally followed by ":DICTIONARY:MARKER", the ArUco dictionary and the side of
-    a marker in squares (default ":4X4_50:0.75"); empty: the chessboard that most pictures show. The
-    mount is taken from `model`. Raises NoBoard.
+    a marker in squares (default ":4X4_50:0.75"); empty: the chessboard that most pictures show.
+    `model`: the camera from which the mount is taken. `fisheye`: use OpenCV's fisheye model of the
+    lens. Raises NoBoard if fewer than three pictures show the board, for pictures of different
+    sizes, and if OpenCV finds no lens.
     """
     pictures = [(path, *_read(path)) for path in paths]
     sizes = {grey.shape for _, grey, _ in pictures if grey is not None}

@@ -9,7 +9,8 @@ from typer import Argument, Option
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """One calibration, from a film, from pictures of a drive or from pictures of a board."""
+    """Settings of a calibration from a film, from pictures of a drive or from pictures of a
+    board."""
 
     inputs: Annotated[
         list[str],

@@ -36,8 +36,8 @@ Report = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class CalibratedDrive:
-    """The estimated camera, some of the pictures, and a text about damage of the film (empty if
-    there is none)."""
+    """The estimated camera, up to six of the pictures, and a text about damage of the film (empty
+    if there is none)."""
 
     found: DriveEstimate
     shown: list[Picture]
@@ -51,8 +51,13 @@ def calibrate_film(
     report: Report = lambda done, total: None,
     longest_s: float = LONGEST_S,
 ) -> CalibratedDrive:
-    """Estimate the camera of the film `path` from at most its first `longest_s` seconds. Raises
-    NotCalibrated, or UserError for a file that is not a film."""
+    """Estimate the camera of the film `path` from at most its first `longest_s` seconds.
+
+    `make_lens(size)` returns the lens for pictures of `size` (width, height) px; `lane_width_m`:
+    width of the lane driven in, None if unknown; `report(done_s, total_s)` is called for each
+    picture. Raises NotCalibrated if too few pictures show a marked straight road, UserError for a
+    file that is not a film.
+    """
     header = read_film_header(path)
     fps = header.fps or DEFAULT_FPS
     total = min(header.count / fps, longest_s) if header.count else longest_s
@@ -82,7 +87,11 @@ def calibrate_pictures(
     lane_width_m: float | None = None,
     report: Report = lambda done, total: None,
 ) -> CalibratedDrive:
-    """Estimate the camera of pictures of a drive, in the order of time. Raises NotCalibrated."""
+    """Estimate the camera of the pictures `paths` of a drive, which are in the order of time.
+
+    `make_lens`, `lane_width_m`: as for `calibrate_film`; `report(done, total)` is called with
+    numbers of pictures. Raises NotCalibrated if too few pictures show a marked straight road.
+    """
 
     def timed() -> Iterator[tuple[float, Picture]]:
         for number, path in enumerate(paths):

@@ -47,7 +47,7 @@ MOTION_ROUNDS = 2
 
 @dataclass(frozen=True)
 class DriveEstimate:
-    """The estimated camera, with standard deviations of its mount in degrees and m."""
+    """The estimated camera, and the standard deviations of its mount in degrees and m."""
 
     camera: CameraParameters
     pitch_std_deg: float
@@ -97,8 +97,8 @@ class DriveEstimate:
 class DriveCalibration:
     """Collects pictures of a drive and estimates the mount of their camera.
 
-    The position x, y of `lens` on the car is kept; height and angles are estimated. Without a given
-    lane width, `LANE_WIDTH_M` is assumed.
+    The position x, y of `lens` on the car is kept; height and angles are estimated. The lane is
+    assumed to be 3.6 m wide if `lane_width_m` is None.
     """
 
     def __init__(self, lens: KnownLens, lane_width_m: float | None = None) -> None:
@@ -117,7 +117,7 @@ class DriveCalibration:
 
     @property
     def pictures(self) -> int:
-        """Number of pictures so far whose markings are used."""
+        """Number of pictures whose markings are used for the estimate, at most the latest 600."""
         return len(self._samples)
 
     def add(self, picture: NDArray[np.uint8], time_s: float, *, bgr: bool = False) -> None:
@@ -141,7 +141,8 @@ class DriveCalibration:
                     self._tracks.append((begin, time_s - begin, self._normalised_tracks(tracks)))
 
     def estimate(self) -> DriveEstimate:
-        """Estimate the camera from the pictures so far. Raises NotCalibrated."""
+        """Estimate the camera from the pictures added so far. Raises NotCalibrated if too few of
+        them show a marked straight road, or if pitch or yaw is uncertain by more than 1 degree."""
         width = self._lane_width_m
         start = find_vanishing_point(sample.lines for sample in self._samples)
         if start is None:
@@ -225,15 +226,15 @@ class DriveCalibration:
 
 
 def check_lane_width(lane_width_m: float | None) -> None:
-    """Raise UserError for a lane width outside `LANE_WIDTHS_M`; None is allowed."""
+    """Raise UserError for a lane width outside 2 to 6 m; None is allowed."""
     low, high = LANE_WIDTHS_M
     if lane_width_m is not None and not low <= lane_width_m <= high:
         raise UserError(f"--lane-width {lane_width_m:g} m; give {low:g} to {high:g} m")
 
 
 def normalised(segments: Segments, view: CameraParameters) -> Lines:
-    """Convert segments from px of the camera `view` to normalised coordinates: straight lines
-    between the rays of their ends."""
+    """Convert segments from px of the camera `view` to normalised coordinates without lens
+    distortion. Each segment becomes the straight line between its two converted ends."""
     half = 0.5 * segments.rows
     ends = [
         view.rays(

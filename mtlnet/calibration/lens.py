@@ -1,5 +1,5 @@
-"""Finds the lens of a camera before its mount is estimated: given, from the EXIF of a photo, or
-guessed."""
+"""Finds the lens of a camera before its mount is estimated. The lens is given by the user, read
+from the EXIF of a photo, or guessed."""
 
 from dataclasses import dataclass, replace
 from math import atan, degrees, hypot, radians, tan
@@ -24,8 +24,8 @@ HEAD_BYTES = 1 << 17
 
 @dataclass(frozen=True)
 class KnownLens:
-    """A camera's size and lens. `std`: relative standard deviation of the focal length; `about`: a
-    text about the source of these values."""
+    """A camera with the size and lens of its pictures. `std`: relative standard deviation of the
+    focal length; `about`: a text that names the source of the lens."""
 
     camera: CameraParameters
     std: float
@@ -39,11 +39,12 @@ def find_lens(
     fov_y_deg: float | None = None,
     photo: Path | None = None,
 ) -> KnownLens:
-    """Return the lens of pictures of `size` (width, height).
+    """Return the lens of pictures of `size` (width, height), px.
 
-    The lens is the first of these that is not None: the lens `given`, the field of view
-    `fov_y_deg`, the focal length of `photo`; else it is a guess. Unless it is `given`, its position
-    on the car is the position of the model's camera. Raises UserError.
+    It is taken from the first of these that is not None: the camera `given`, the vertical field of
+    view `fov_y_deg`, the EXIF of `photo`. If all are None, a field of view of 65 degrees along the
+    longer side is assumed. The camera's position on the car is the position of `given`, else of
+    `model`. Raises UserError if the source does not fit the pictures or states no focal length.
     """
     width, height = size
     if given is not None:

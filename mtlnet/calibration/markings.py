@@ -1,8 +1,8 @@
 """Finds bright or yellow bars in the rows of a road picture, and the segments that they form.
 
-In an image row, a marking is w n px wide, whatever its direction: w is the width of its paint in
-camera heights, n the number of rows below the horizon. Pixels: u to the right, v down, pixel
-centres at whole numbers.
+In an image row that is n rows below the horizon, a marking is n w / h px wide, whatever its
+direction; w is the width of its paint and h the height of the camera, both in m. Pixels: u to the
+right, v down, pixel centres at whole numbers.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Segments:
-    """N straight segments of markings in a picture: middle u, v (px); slope du/dv with its standard
-    deviation; number of rows that the segment covers."""
+    """N straight segments of markings in a picture, as arrays (N,): position `u`, `v` of the middle
+    (px), `slope` du/dv and its standard deviation, and number of `rows` that the segment covers."""
 
     u: FloatArray
     v: FloatArray
@@ -41,8 +41,9 @@ class Segments:
 
 
 def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
-    """Find the segments of bars in an RGB picture (H, W, 3). `horizon_px`: estimated row of the
-    horizon, on which the expected width of the bars depends."""
+    """Find the bright or yellow bars in an RGB picture (H, W, 3), and return the straight segments
+    that they form. `horizon_px`: estimated row of the horizon, on which the expected width of the
+    bars depends."""
     height = len(picture)
     top = int(np.clip(horizon_px + 0.02 * height, 0, height - MIN_ROWS))
     below = cv2.GaussianBlur(picture[top:], (3, 3), 0.0).astype(np.float32)

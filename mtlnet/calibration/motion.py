@@ -39,8 +39,9 @@ class Motion:
 
 
 def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | None:
-    """Follow points between two grayscale images; returns (N, 4): u and v in px in `before`, then
-    in `after`. None if too few points can be followed or nothing moves."""
+    """Follow points between two grayscale images (H, W); returns (N, 4): u and v in px in `before`,
+    then in `after`. None if fewer than 40 points can be followed, or if fewer than a quarter of
+    them move by 0.5 px."""
     seen = np.full(before.shape, 255, np.uint8)
     seen[round((1 - BONNET) * len(seen)) :] = 0
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)
@@ -67,7 +68,8 @@ def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Any) -> t
 
 
 def find_motion(tracks: FloatArray, towards: FloatArray, noise: float) -> Motion | None:
-    """Estimate the motion from normalised `tracks` (N, 4); None if they do not determine it.
+    """Estimate the camera's motion from `tracks` (N, 4), the normalised x, y of N points in the
+    first picture, then in the second. None if the tracks do not determine the motion.
 
     `towards` (2,): a first guess of the point towards which the camera travels. `noise`: standard
     deviation of a track, in normalised coordinates.

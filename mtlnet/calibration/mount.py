@@ -48,7 +48,7 @@ ROLL_ROUNDS = 3
 
 
 class NotCalibrated(UserError):
-    """The drive does not show how the camera is mounted."""
+    """Raised when the pictures of a drive do not show how the camera is mounted."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ class Sample:
 
 @dataclass(frozen=True)
 class TimedMotion:
-    """The motion between two pictures, `seconds` apart; `time_s`: time of the first one."""
+    """The motion between two pictures that are `seconds` apart; `time_s`: time of the first
+    picture, s."""
 
     time_s: float
     seconds: float
@@ -109,8 +110,12 @@ def find_mount(
     lane_width_m: float,
     lane_width_std_m: float,
 ) -> Mount:
-    """Estimate the mount. `start`: the film's vanishing point in normalised coordinates. Raises
-    NotCalibrated."""
+    """Estimate the mount from the markings in pictures and the motions between pictures.
+
+    `start`: the film's vanishing point (x, y) in normalised coordinates; `lane_width_m`,
+    `lane_width_std_m`: width of the lane and its standard deviation. Raises NotCalibrated if fewer
+    than twelve pictures show both markings of a lane on straight road.
+    """
     roll, level = 0.0, start
     for _ in range(ROLL_ROUNDS):
         roads = _fit_roads(samples, roll, level, lane_width_m)

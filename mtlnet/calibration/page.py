@@ -1,4 +1,5 @@
-"""The HTML page of a calibration: corners of a board, or a lane as the camera should see it."""
+"""Writes the HTML page of a calibration, whose pictures show the corners found on a board, or a
+lane drawn with the estimated camera."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ Picture = NDArray[np.uint8]
 
 
 def write_board_page(path: Path, found: BoardCalibration) -> None:
-    """Write the page of a board: each picture with its corners and its error."""
+    """Write the page of a board's calibration: each picture with its corners and its error, px."""
     figures = [
         {"jpeg": embed_jpeg(draw_corners(picture)), "title": picture.path.name, "text": about}
         for picture in found.pictures
@@ -60,7 +61,8 @@ def _lens_lines(found: BoardCalibration) -> list[str]:
 
 
 def draw_corners(picture: BoardPicture) -> Picture:
-    """Return the picture, `WIDTH` px wide, with its corners, and their errors if it was used."""
+    """Return the picture, 640 px wide, with the corners found. If the picture was used, the errors
+    of the corners' projections are drawn too, 20 times as long."""
     image = read_whole_image(picture.path)
     scale = WIDTH / image.shape[1]
     image = _scaled(image, scale)
@@ -75,7 +77,8 @@ def draw_corners(picture: BoardPicture) -> Picture:
 
 
 def write_drive_page(path: Path, drive: CalibratedDrive, name: str) -> None:
-    """Write the page of a drive: pictures with the horizon and the markings of a straight lane."""
+    """Write the page of a drive's calibration: pictures with the horizon and a straight lane, as
+    the estimated camera sees them. `name`: name of the film or pictures, for the title."""
     found = drive.found
     std = [found.pitch_std_deg, found.yaw_std_deg, found.roll_std_deg, found.height_std_m]
     camera = found.camera
@@ -108,7 +111,8 @@ def write_drive_page(path: Path, drive: CalibratedDrive, name: str) -> None:
 
 
 def draw_lane(picture: Picture, camera: CameraParameters, lane_width_m: float) -> Picture:
-    """Return the picture, `WIDTH` px wide, with the horizon and a straight lane drawn in."""
+    """Return the picture, 640 px wide, with the horizon and a straight lane `lane_width_m` wide
+    drawn in, as `camera` sees them."""
     image = _scaled(picture, WIDTH / picture.shape[1])
     camera = camera.resized(image.shape[1], image.shape[0])
     road = -camera.cg_height_m

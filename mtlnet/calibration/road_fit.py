@@ -2,8 +2,8 @@
 
 Normalised image coordinates x, y: pixels from the principal point divided by the focal length,
 corrected for roll. A marking of a flat road is x = x0 + a s + b / s with s = y - y0 > 0. Here (x0,
-y0) is the vanishing point at the camera, `a` is the marking's lateral offset divided by height
-cos(heading) / cos(pitch), and b = curvature * height / 2 bends all markings alike.
+y0) is the vanishing point of the road's direction at the camera. The slope a is (lateral offset /
+height) * cos(pitch) / cos(heading), and b = curvature * height / 2 bends all markings alike.
 """
 
 from dataclasses import dataclass
@@ -32,8 +32,8 @@ ROUNDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """N segments in normalised coordinates: middle x, y; slope dx/dy with its standard deviation;
-    height `size`."""
+    """N segments in normalised coordinates, as arrays (N,): position `x`, `y` of the middle,
+    `slope` dx/dy and its standard deviation, and `size`, the extent in y."""
 
     x: FloatArray
     y: FloatArray
@@ -48,7 +48,8 @@ class Lines:
         )
 
     def turned(self, roll: float) -> "Lines":
-        """Return the segments as a camera without this camera's `roll` (rad) would see them."""
+        """Return the segments as this camera would see them if it had no roll. `roll`: its roll,
+        rad."""
         c, s = np.cos(roll), np.sin(roll)
         along = c + self.slope * s  # the vertical part of (slope, 1) after the rotation
         return Lines(
@@ -62,8 +63,9 @@ class Lines:
 
 @dataclass(frozen=True)
 class RoadFit:
-    """The fit of one picture: vanishing point x0, y0, and bend b. `y0_std` includes only the error
-    of the fit."""
+    """The fit of one picture, in normalised coordinates: vanishing point x0, y0, and bend b.
+    `y0_std` is the standard deviation of y0 from the fit alone, without the movement of the car on
+    its springs."""
 
     x0: float
     y0: float
@@ -74,8 +76,8 @@ class RoadFit:
 
 
 def fit_road(lines: Lines, x0: float, y0: float) -> RoadFit | None:
-    """Fit the road near the film's vanishing point (x0, y0); None where the markings do not
-    determine the fit."""
+    """Fit the road to the segments `lines`, with a vanishing point near the film's vanishing point
+    (x0, y0). None where the segments do not determine the fit."""
     usable = (lines.y > y0 + MIN_BELOW) & (np.abs(lines.slope) < MAX_SLOPE)
     lines = lines.chosen(usable)
     start = _crossing(lines, x0, y0)

@@ -29,7 +29,8 @@ def fit(design: FloatArray, values: FloatArray, weight: FloatArray) -> FloatArra
 
 
 def mean(values: FloatArray, weight: FloatArray | None = None) -> float:
-    """Return Huber's robust mean of `values` (N,)."""
+    """Return Huber's robust mean of `values` (N,). `weight` (N,): weights of the values; None: all
+    1."""
     ones = np.ones((len(values), 1))
     return float(fit(ones, values, np.ones(len(values)) if weight is None else weight)[0])
 
@@ -40,8 +41,11 @@ def bootstrap_std(
     rng: np.random.Generator,
     draws: int = 60,
 ) -> FloatArray:
-    """Return the standard deviations of `estimate(rows)` over resampled blocks of rows (bootstrap,
-    Efron 1979): half the width of the central 68 % interval. `block` (N,): the block of each row.
+    """Return the standard deviations (P,) of `estimate(rows)` over resampled blocks of rows
+    (bootstrap, Efron 1979): half the width of the central 68 % interval.
+
+    `block` (N,): number of the block of each row; `estimate`: computes P values from row indices
+    (M,).
     """
     rows_of = [np.flatnonzero(block == name) for name in np.unique(block)]
     found = []
