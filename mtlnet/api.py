@@ -36,7 +36,8 @@ log = logging.getLogger("mtlnet")
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Prediction):
-    """The track features of one image: the attributes of `Prediction`, and the image's camera."""
+    """The track features of one image. It has all attributes of `Prediction`, and the image's
+    camera."""
 
     source: SourceImage
     """The image in the model's view, with its name and time."""
@@ -47,21 +48,23 @@ class Features(Prediction):
 
     @property
     def name(self) -> str:
-        """The image's file; `film.mp4#12` for frame 12 of a film; empty for bytes and pixels."""
+        """Name of the image: its file, or `film.mp4#12` for frame 12 of a film. Empty for an image
+        that was given as bytes or pixels."""
         return self.source.name
 
     @property
     def time_s(self) -> float | None:
-        """Time of the image in s: since 1970 if it was recorded, else since the start of its film;
-        None if it is unknown."""
+        """Time of the image, s: since the start of its film or recorded round, or since 1970 for an
+        image of a stream, webcam or ROS 2 bag. None if it is unknown."""
         return self.source.time_s
 
     def draw(self, image: OneImage | None = None) -> Image:
         """Draw the features; returns a picture (H, W, 3), uint8 RGB.
 
-        `image`: the image that was predicted; the markings are drawn on a copy of it, as straight
-        lines on a flat road. None: draws the image in the model's view, with the markings, a view
-        from above and the features as text.
+        `image`: the image that was given to `predict`, at any size of its aspect ratio; the
+        markings are drawn on a copy of it, as straight lines on a flat road. None: the result is
+        the image in the model's view, with the markings, a view from above and the features as
+        text.
         """
         if image is None:
             return draw_prediction(self.source, self, self.model_camera)
@@ -83,7 +86,8 @@ class Options(TypedDict, total=False):
 
 
 class Model:
-    """A trained model. Several threads can call it at once; it predicts one image at a time."""
+    """A trained model. Several threads can call the same model; their images are predicted one at a
+    time."""
 
     def __init__(
         self, run: Path, engine: str = "openvino", precision: str | None = None, threads: int = 1
@@ -195,11 +199,13 @@ class Model:
         copies: str = "",
         page: str | Path | None = None,
     ) -> dict[str, Any]:
-        """Return the errors on a dataset, as `mtlnet evaluate --json` prints them, in m and rad.
+        """Return the errors on a dataset in m and rad, with the keys that `mtlnet evaluate --json`
+        prints.
 
         `data`: a folder of recorded rounds, or of pictures with a `labels.csv`. `split`: train,
-        test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" adds copies of
-        pictures. `page`: an HTML file to write. Raises UserError.
+        test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" also evaluates
+        mirrored and turned copies of pictures. `page`: an HTML file to write. Raises UserError for
+        data that cannot be read or do not fit the model.
         """
         from mtlnet.evaluation.evaluate import evaluate
 
@@ -218,10 +224,11 @@ class Model:
     ) -> dict[str, Any]:
         """Write the model in another format and compare it with torch, as `mtlnet export` does.
 
-        `form`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". `data`: the dataset
-        whose frames are compared, `frames` of them; None: the training data. `out`: the folder to
-        write; None: a folder in `export/` of the model's folder. Returns the result of `mtlnet
-        export --json`. Raises UserError for an unsupported export, ModelError for a difference.
+        `form`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". `data`: the dataset of
+        the comparison, from which `frames` frames are taken; None: the training data. `out`: the
+        folder to write; None: a folder in `export/` of the model's folder. Returns the result of
+        `mtlnet export --json`. Raises UserError for an unsupported export, ModelError when an f32
+        export differs from torch by more than the tolerance.
         """
         from mtlnet.export.convert import export_model
 

@@ -2,12 +2,12 @@
 
 `mtl`: the paper's network (section IV-C), with TensorFlow's SAME padding.
 
-`deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), with which the paper compares:
-AlexNet with a fourth fully connected layer, trained on one task, the regression of coded values.
-Layers, padding and local response normalisation are taken from the authors' Caffe model.
-Deviations: the outputs are our six coded values instead of their fourteen, and linear, without a
-sigmoid; no mean image is subtracted; training uses our recipes. It has no classifier: each class
-has probability one third.
+`deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), with which the paper compares
+its network. It is AlexNet with a fourth fully connected layer, trained on one task, the regression
+of coded values. Layers, padding and local response normalisation are taken from the authors' Caffe
+model. Deviations: it has our six coded values as outputs instead of their fourteen; its outputs are
+linear, without a sigmoid; no mean image is subtracted; it is trained with the recipes of `mtlnet
+train`. It has no classifier: each class has probability one third.
 
 `grid`: five convolutions that keep a grid of 9 x 18 positions; the paper's convolutions end in a
 single position. Its outputs are distributions over bins (`mtlnet.model.bins`). It does not read the
@@ -18,8 +18,8 @@ the grid and the curvature ahead from the shared features (`mtlnet.model.auxilia
 from a trained `grid` (`mtlnet.model.pretrained`).
 
 `mobilenet_v3_small`, `regnet_y_400mf`: for comparison, small modern backbones of torchvision with
-random initial weights. One layer of 256 units follows their pooled features; the nine outputs are
-those of `mtl`.
+random initial weights. One layer of 256 units follows their pooled features; they have the same
+nine outputs as `mtl`.
 """
 
 from dataclasses import dataclass, replace
@@ -33,8 +33,8 @@ HEIGHT, WIDTH = 210, 280
 class Conv:
     """A convolution and ReLU, the paper's Conv(n, k, s): n filters of k x k, stride s.
 
-    `pad`: zeros at each side, None for SAME padding. `skip`: the input is added to the output (a
-    residual connection, He et al. 2015).
+    `pad`: number of zeros added at each side; None: SAME padding. `skip`: the input is added to the
+    output (a residual connection, He et al. 2015).
     """
 
     filters: int
@@ -47,8 +47,8 @@ class Conv:
 
 @dataclass(frozen=True)
 class Pool:
-    """MaxPool(k, s). `same`: SAME padding, as in the paper; False: no padding, and the output's
-    size is rounded up, as in Caffe."""
+    """A layer of max pooling, the paper's MaxPool(k, s). `same`: it has SAME padding, as in the
+    paper. Otherwise it has no padding, and the output's size is rounded up, as in Caffe."""
 
     kernel: int = 3
     stride: int = 2
@@ -96,14 +96,14 @@ class Architecture:
 
     @property
     def keeps_places(self) -> bool:
-        """Whether the last features form a grid of positions in the image instead of a single
-        position."""
+        """Whether the output of the last convolution or pooling layer has more than one position in
+        the image."""
         return bool(self.features) and grid_size(self)[1] > 1
 
     @property
     def uncertainty_inputs(self) -> int:
-        """Number of inputs of the uncertainty head: the last shared features and, with heads over
-        bins, the spreads of the six distributions."""
+        """Number of inputs of the uncertainty head: the units of the last shared layer and, for a
+        network with bins, the spreads of the distributions of the five distances and the angle."""
         return self.shared[-1] + (6 if self.bins else 0)
 
     @property
@@ -202,8 +202,9 @@ def find_architecture(name: str) -> Architecture:
 
 
 def with_heads(name: str, kind: str) -> str:
-    """Return the name of network `name` with heads of `kind`, one of `HEAD_KINDS`. Raises UserError
-    for an unknown kind or name."""
+    """Return the name of network `name` with heads of `kind`, "coded" or "bins": for example
+    `mtl-bins`, or `mtl` if these are its usual heads. Raises UserError for an unknown kind or name.
+    """
     if kind not in HEAD_KINDS:
         raise UserError(f"--heads {kind!r} is unknown; give {' or '.join(HEAD_KINDS)}")
     base = name.removesuffix("-bins").removesuffix("-coded")
@@ -211,7 +212,8 @@ def with_heads(name: str, kind: str) -> str:
 
 
 def require_task_heads(architecture: Architecture, alpha: tuple[float, float, float]) -> None:
-    """Raise UserError when `alpha` gives weight to a task for which the network has no head."""
+    """Raise UserError when the task weights `alpha` (distance, angle, class) give weight to the
+    class and the network has no classifier."""
     if alpha[2] > 0 and "heading" not in architecture.tasks:
         raise UserError(
             f"network {architecture.name} has no class, so alpha's third weight must be 0, not "
@@ -220,15 +222,15 @@ def require_task_heads(architecture: Architecture, alpha: tuple[float, float, fl
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int, int]:
-    """Return the output size, and the numbers of zeros before and after the `size` input values, of
-    TensorFlow's SAME padding."""
+    """Return the output size of TensorFlow's SAME padding for `size` input values, and the numbers
+    of zeros that it adds before and after them."""
     out = -(-size // stride)
     total = max((out - 1) * stride + kernel - size, 0)
     return out, total // 2, total - total // 2
 
 
 def grid_size(architecture: Architecture) -> tuple[int, int, int]:
-    """Return channels, rows and columns of the last features."""
+    """Return channels, rows and columns of the output of the last convolution or pooling layer."""
     channels, height, width = 3, HEIGHT - architecture.first_row, WIDTH
     for spec in architecture.features:
         height, width = output_size(height, spec), output_size(width, spec)

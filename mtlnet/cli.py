@@ -62,7 +62,7 @@ def ablate_command(
     as_json: command.AsJson = False,
 ) -> None:
     """Train and evaluate the rows of the paper's ablation table: each task alone, four task
-    weightings (MTL 1 to 4), and two other networks."""
+    weightings (MTL 1 to 4), DeepDriving and a torchvision backbone."""
     from mtlnet.ablation.plan import ablation_rows
     from mtlnet.ablation.run import ablate
 
@@ -106,7 +106,8 @@ def ship_command(
     picture: options.ShippedPicture = None,
     as_json: command.AsJson = False,
 ) -> None:
-    """Write a model at half the size: weights in float16, and the graph that `serve` loads.
+    """Write a model at half the size, with weights in float16, and with the graph that `serve`
+    loads.
 
     With --evaluation: write README.md, with the figures of evaluations, for the model in --out.
     """
