@@ -1,9 +1,9 @@
 """Augments images and their labels by another camera pose: a lateral shift and a rotation.
 
-When the camera moves left by s m, a point at depth Z m appears s f / Z px further right. On a flat
-road this shift is s / h px per row below the horizon, with h the height of the camera in m. So the
-image is sheared below the horizon and unchanged above it. This is correct for markings near the
-car; objects that stand on the road are sheared too.
+When the camera moves left by s m, a point at depth Z m appears s f / Z px further right, with f the
+focal length in px. On a flat road this shift is s / h px per row below the horizon, with h the
+height of the camera in m. So the image is sheared below the horizon and unchanged above it. This is
+correct for markings near the car; objects that stand on the road are sheared too.
 
 A rotation about the optical centre is a homography of the image (Hartley and Zisserman 2004,
 section 8.4). It is exact for any scene, except at the image border.
@@ -27,7 +27,7 @@ ROTATIONS = 64  # number of rotations, whose maps are computed once; number 0 is
 
 
 def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: float) -> None:
-    """Shift the camera of an image (H, W, 3) to the left by `metres`, in place."""
+    """Change an image (H, W, 3), in place, as if its camera were `metres` further to the left."""
     horizon = horizon_row(camera)
     first = max(int(np.ceil(horizon)), 0)
     road = image[first:]
@@ -40,24 +40,24 @@ def shift_lateral(image: NDArray[np.uint8], camera: CameraParameters, metres: fl
 
 
 def horizon_row(camera: CameraParameters) -> float:
-    """Row of the horizon of a level road, px from the centre of the first row."""
+    """Return the row of the horizon of a level road, px from the centre of the first row."""
     middle = camera.intrinsics()[1, 2]
     return float(middle - camera.focal_px * np.tan(np.radians(camera.pitch_deg)))
 
 
 def shear_per_metre(camera: CameraParameters) -> float:
-    """Shift of an image row to the right, px, for each row that it is below the horizon and each
-    metre that the camera moves to the left."""
+    """Return the shift to the right, px, of an image row that is one row below the horizon, when
+    the camera moves to the left by one metre."""
     return float(np.cos(np.radians(camera.pitch_deg)) / camera.height_above_road_m)
 
 
 def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Limits (N, 2), m, of a shift to the right (negative) and to the left, within which the labels
-    after the shift can be computed.
+    """Return the limits (N, 2), m, of a shift of the camera to the right (negative) and to the
+    left. Within the limits the labels after the shift can be computed from the labels before it.
 
-    `distances` (N, 5) in m, NaN where absent, infinity where the label is unknown. Beyond a limit
-    another marking would be measured, whose distance or presence is not labelled. A marking with an
-    unknown label sets no limit for a car in its lane; elsewhere it allows no shift.
+    `distances` (N, 5) in m, NaN where absent, infinity where the label is unknown. Beyond a limit,
+    a distance to a marking that is not labelled would be needed. A marking with an unknown label
+    sets no limit for a car that has `ml` and `mr`; without these it allows no shift.
     """
     unknown = np.isinf(distances)
     ml, mr, l, m, r = np.where(unknown, np.nan, distances).astype(np.float64).T
@@ -80,7 +80,8 @@ def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
 def lateral_shift_m(
     share: NDArray[np.float64], distances: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Shifts (N,) to the left, m, for shares (N,) in [-1, 1] of the limits of `shift_limits_m`."""
+    """Return the shifts (N,) to the left, m, for shares (N,) in [-1, 1] of the limits that
+    `shift_limits_m` returns for `distances` (N, 5), m."""
     to_the_right, to_the_left = shift_limits_m(distances).T
     metres: NDArray[np.float64] = np.where(share < 0, -share * to_the_right, share * to_the_left)
     return metres
@@ -88,7 +89,8 @@ def lateral_shift_m(
 
 @lru_cache(maxsize=1)
 def rotations() -> NDArray[np.float64]:
-    """Yaw to the left and pitch downwards, rad, of all rotations: (ROTATIONS, 2); row 0 is zero."""
+    """Return yaw to the left and pitch downwards, rad, of all 64 rotations (64, 2). Row 0 is
+    zero."""
     rng = np.random.default_rng(0)
     # Quantiles, because so few random values would represent the normal distribution badly.
     quantiles = (np.arange(1, ROTATIONS) - 0.5) / (ROTATIONS - 1)
@@ -99,8 +101,8 @@ def rotations() -> NDArray[np.float64]:
 
 
 def rotate(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> None:
-    """Replace an image (H, W, 3) by the image of a rotated camera; `number` is the row of
-    `rotations` with the angles."""
+    """Replace an image (H, W, 3), in place, by the image of a rotated camera. `number`: index, in
+    the result of `rotations`, of the yaw and pitch."""
     coarse, fine = rotation_maps(camera, number)
     border = cv2.BORDER_REFLECT_101
     cv2.remap(image.copy(), coarse, fine, cv2.INTER_LINEAR, dst=image, borderMode=border)
@@ -110,8 +112,8 @@ def rotate(image: NDArray[np.uint8], camera: CameraParameters, number: int) -> N
 def rotation_maps(
     camera: CameraParameters, number: int
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Source pixel of each pixel of an image rotated by rotation `number`, as the fixed-point maps
-    (H, W, 2) and (H, W) of cv2.remap."""
+    """Return the source pixel of each pixel of an image rotated by rotation `number` (an index in
+    `rotations`), as the fixed-point maps (H, W, 2) and (H, W) of cv2.remap."""
     inverse = np.linalg.inv(rotation_homography(camera, *rotations()[number].tolist()))
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y, scale = np.tensordot(inverse, np.stack([columns, rows, np.ones_like(rows)]), 1)
@@ -123,8 +125,8 @@ def rotation_maps(
 def rotation_homography(
     camera: CameraParameters, yaw: float, pitch: float = 0.0
 ) -> NDArray[np.float64]:
-    """Homography (3, 3) from the pixels of an image to its pixels after the car is rotated left by
-    `yaw` and the camera is tilted down by `pitch`, rad."""
+    """Return the homography (3, 3) from the pixels of an image to its pixels after the car is
+    rotated left by `yaw` (rad) and the camera is tilted down by `pitch` (rad)."""
     return camera.homography(
         replace(
             camera,
@@ -140,10 +142,11 @@ def rotate_labels(
     yaw: NDArray[np.float64],
     camera: CameraParameters,
 ) -> NDArray[np.float32]:
-    """Coded targets (B, 6) after the car is rotated left by `yaw` (B,) rad about its camera.
+    """Return the coded targets (B, 6) after the car is rotated left by `yaw` (B,) rad about its
+    camera.
 
-    `distances` (B, 5) in m and `angle` (B,) in rad are the labels before. The centre of gravity,
-    `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
+    `distances` (B, 5) in m and `angle` (B,) in rad are the labels before the rotation. The centre
+    of gravity, `camera.x` behind the camera, moves to the right by camera.x sin(yaw).
     """
     shift = -camera.x * np.sin(yaw)
     return tf.encode(distances + shift[:, None], angle - yaw)

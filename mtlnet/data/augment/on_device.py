@@ -30,7 +30,7 @@ BLUR_RADIUS = 3
 
 
 def to_device(values: NDArray[Any], device: torch.device) -> Tensor:
-    """The array as a tensor on `device`.
+    """Return the array as a tensor on `device`.
 
     It is copied to a GPU from pinned memory. A copy from pageable memory can wait for the kernels
     in the queue, and the GPU would then idle while the next batch is made.
@@ -42,7 +42,8 @@ def to_device(values: NDArray[Any], device: torch.device) -> Tensor:
 
 
 class DeviceAugment:
-    """Applies AugmentParams on `device` to images without the rows above `first_row`."""
+    """Applies AugmentParams on `device` to images from which the rows above `first_row` were
+    removed."""
 
     def __init__(self, camera: CameraParameters, first_row: int, device: torch.device) -> None:
         self._camera = camera
@@ -57,7 +58,8 @@ class DeviceAugment:
         )
 
     def __call__(self, images: Tensor, params: AugmentParams, seed: int) -> Tensor:
-        """Augmented images uint8 (B, h, W, 3); `seed` is the seed of the noise."""
+        """Return the augmented images, uint8 (B, h, W, 3), of `images`, uint8 (B, h, W, 3), with h
+        the number of rows from `first_row` on. `seed`: the seed of the noise."""
         x = images.permute(0, 3, 1, 2).float()
         x = self._moved(x, params)
         shade = self._shades.index_select(0, self._on(params.shadow)).permute(0, 3, 1, 2)
@@ -145,7 +147,8 @@ class DeviceAugment:
 
 @lru_cache(maxsize=4096)
 def blur_kernel(deviation_px: float) -> NDArray[np.float32]:
-    """Weights (2 BLUR_RADIUS + 1,) of a normal distribution, truncated as in OpenCV's blur."""
+    """Return the weights (7,) of a normal distribution with the standard deviation `deviation_px`,
+    for the pixels -3 to 3. They are truncated as in OpenCV's blur, and their sum is 1."""
     away = np.arange(-BLUR_RADIUS, BLUR_RADIUS + 1)
     weight = np.exp(-0.5 * (away / deviation_px) ** 2) * (np.abs(away) <= round(2 * deviation_px))
     kernel: NDArray[np.float32] = (weight / weight.sum()).astype(np.float32)

@@ -19,10 +19,11 @@ STORED_NOISE_STD = 32.0  # standard deviation of the stored noise; its mean is 1
 
 
 def draw_colour_transforms(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Random affine colour transforms (`count`, 3, 4), from (r, g, b, 1) to (r, g, b), 0 to 255.
+    """Return random affine colour transforms (`count`, 3, 4), from (r, g, b, 1) to (r, g, b), 0 to
+    255.
 
-    They change the saturation, then the contrast about middle grey and the brightness. Contrast and
-    brightness have a change of all channels and one of each channel.
+    They change the saturation, then the contrast about middle grey and the brightness. The changes
+    of contrast and brightness have a part for all channels and a smaller part for each channel.
     """
     saturation = 1.0 + rng.uniform(-SATURATION, SATURATION, (count, 1, 1))
     mixed = saturation * np.eye(3) + (1.0 - saturation) * np.array(LUMA)
@@ -43,8 +44,8 @@ def blur(image: NDArray[np.uint8], std_px: float) -> None:
 
 
 def add_noise(image: NDArray[np.uint8], std: float, start: int) -> None:
-    """Add normal noise with standard deviation `std`, in levels of 0 to 255. The noise is read from
-    the stored noise, starting at index `start`."""
+    """Add normal noise with standard deviation `std`, in levels of 0 to 255, to the image, in
+    place. The noise is a part of the array `stored_noise`, from index `start` on."""
     noise = stored_noise(2 * image.size)[start : start + image.size].reshape(image.shape)
     weight = std / STORED_NOISE_STD
     cv2.addWeighted(image, 1.0, noise, weight, -128.0 * weight, dst=image)
@@ -52,8 +53,8 @@ def add_noise(image: NDArray[np.uint8], std: float, start: int) -> None:
 
 @lru_cache(maxsize=2)
 def stored_noise(size: int) -> NDArray[np.uint8]:
-    """Normal noise (size,) with mean 128 and standard deviation `STORED_NOISE_STD`. It is stored,
-    because new noise for each image would take most of the time."""
+    """Return normal noise (size,) with mean 128 and standard deviation 32. It is computed once per
+    size, because new noise for each image would take most of the time."""
     drawn = np.random.default_rng(0).standard_normal(size, np.float32)
     return (128 + STORED_NOISE_STD * drawn).round().clip(0, 255).astype(np.uint8)
 

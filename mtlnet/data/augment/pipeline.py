@@ -57,12 +57,14 @@ class AugmentParams:
     border: NDArray[np.int64]  # (B, 4) px without a picture at the top, bottom, left, right
 
     def take(self, rows: slice) -> "AugmentParams":
-        """The parameters of the images in `rows`."""
+        """Return the parameters of the images in the slice `rows`."""
         return AugmentParams(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def draw_params(count: int, height: int, width: int, rng: np.random.Generator) -> AugmentParams:
-    """Random parameters of `count` images; call `resolve_lateral_shift` before applying them."""
+    """Return random parameters of `count` images of `height` x `width` px. Their `shift` is a share
+    of the allowed shift; `resolve_lateral_shift` converts it to m before the parameters are
+    applied."""
     return AugmentParams(
         shift=rng.uniform(-1.0, 1.0, count) * (rng.random(count) < SHIFT_SHARE),
         rotation=rng.integers(1, ROTATIONS, count) * (rng.random(count) < ROTATION_SHARE),
@@ -102,14 +104,16 @@ def _draw_border(
 
 
 def resolve_lateral_shift(params: AugmentParams, distances: NDArray[np.float32]) -> AugmentParams:
-    """`params` with shifts in m instead of shares, for frames with `distances` (B, 5) in m."""
+    """Return `params` with `shift` converted from a share of the allowed shift to m, for frames
+    with the labels `distances` (B, 5), m."""
     return replace(params, shift=lateral_shift_m(params.shift, distances))
 
 
 def apply_params(
     images: NDArray[np.uint8], params: AugmentParams, camera: CameraParameters
 ) -> None:
-    """Augment images (B, H, W, 3) in the order of image formation: scene, light, lens, file."""
+    """Augment images (B, H, W, 3) in place. The changes are made in the order of image formation:
+    of the scene, the light, the lens, and the file."""
     for row, image in enumerate(images):
         if params.shift[row]:
             shift_lateral(image, camera, float(params.shift[row]))
@@ -147,9 +151,10 @@ def augment_labels(
     params: AugmentParams,
     camera: CameraParameters,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Coded targets (B, 6) and classes (B,) of the augmented images.
+    """Return the coded targets (B, 6) and classes (B,) of the augmented images.
 
-    `distances` (B, 5) in m, `angle` (B,) in rad and `heading` (B,) are the labels of the frames.
+    `distances` (B, 5) in m, `angle` (B,) in rad and `heading` (B,) are the labels before the
+    augmentation.
     """
     shift = (params.shift * np.cos(angle)).astype(np.float32)
     yaw = rotations()[params.rotation, 0]

@@ -28,14 +28,15 @@ def add_shadow(image: NDArray[np.uint8], camera: CameraParameters, number: int) 
 
 
 def shadow_masks(camera: CameraParameters) -> NDArray[np.uint8]:
-    """Remaining light (SHADOWS, H, W, 3), 0 to 255, in all shadows; 255 outside a shadow."""
+    """Return the remaining light, 0 to 255, in all 64 shadows (64, H, W, 3). It is 255 outside a
+    shadow, and everywhere in shadow 0."""
     return np.stack([shadow_mask(camera, number) for number in range(SHADOWS)])
 
 
 @lru_cache(maxsize=2 * SHADOWS)
 def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
-    """Remaining light (H, W, 3), 0 to 255, in shadow `number`, computed at the first use (all
-    shadows together take 6 s)."""
+    """Return the remaining light (H, W, 3), 0 to 255, in shadow `number`. It is computed at the
+    first use; all 64 shadows together take 6 s."""
     if number == 0:
         return np.full((camera.height, camera.width, 3), 255, np.uint8)
     rng = np.random.default_rng()
@@ -56,10 +57,10 @@ def shadow_mask(camera: CameraParameters, number: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=2)
 def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The point of a flat road in each pixel, as two arrays (H, W): m ahead and m left of the
-    camera.
+    """Return the point of a flat road that each pixel shows, as two arrays (H, W): m ahead and m
+    left of the camera.
 
-    Pixels above the horizon or far away are more than `MAX_DISTANCE_M` ahead.
+    Pixels above the horizon, or of points more than 80 m ahead, are set to 80 m ahead and 0 m left.
     """
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
@@ -72,7 +73,7 @@ def road_points(camera: CameraParameters) -> tuple[NDArray[np.float64], NDArray[
 
 @dataclass(frozen=True)
 class Drawn:
-    """Random numbers of one shadow."""
+    """Random parameters of one shadow."""
 
     noise: NDArray[np.float32]  # (FIELD, FIELD)
     leaves: float  # weight of the leaves; the crowns have a weight of 1
