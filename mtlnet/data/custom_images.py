@@ -36,8 +36,7 @@ MAX_READERS = 8  # number of threads; each may hold a photo of 0.8 GB
 @dataclass(frozen=True)
 class CustomImages:
     """N labelled pictures in memory, uint8 (N, H, W, 3) at the size of the model's camera (0.18 MB
-    each). A copy of a picture counts as a picture: every sequence has N entries.
-    """
+    each). A mirrored or turned copy is one of the N pictures, with its own label and camera."""
 
     path: Path
     labels: CustomLabels
@@ -60,7 +59,7 @@ class CustomImages:
         return len(self.images)
 
     def take(self, rows: Any) -> "CustomImages":
-        """The pictures with these row numbers, or in this slice."""
+        """Return the pictures selected by `rows`: indices, a mask (N,) or a slice."""
         chosen = np.arange(len(self))[rows].tolist()
         return replace(
             self,
@@ -73,18 +72,19 @@ class CustomImages:
         )
 
     def every(self, count: int) -> "CustomImages":
-        """Every `count`-th image."""
+        """Return every `count`-th picture, from the first on."""
         return self.take(slice(None, None, count))
 
     def read_batch(
         self, indices: NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
-        """Images (B, H, W, 3) of rows `indices`; written to `out` if it is given."""
+        """Return the images (B, H, W, 3) with the row numbers `indices` (B,), written to `out` if
+        given."""
         return np.take(self.images, indices, axis=0, out=out)
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, K) for the N pictures, with distances converted from metres at the
-        model's camera to metres at the pictures' own cameras.
+        """Return a model's outputs (N, K) for the N pictures, with distances converted from metres
+        at the model's camera to metres at the pictures' own cameras.
 
         `mtlnet.inference.prediction.split_outputs` explains the K columns.
         """
@@ -96,10 +96,10 @@ class CustomImages:
 
     @cached_property
     def for_training(self) -> "CustomImages":
-        """The same pictures with labels converted to metres at the model's camera.
+        """The same pictures, with labels converted to metres at the model's camera.
 
-        Raises UserError with the line of the file if a converted label is outside the range of the
-        network's coding.
+        Raises UserError with the line of `labels.csv` if a converted distance is outside the range
+        of the network's coding.
         """
         distances = self.labels.distances.copy()
         for row, lens in enumerate(self.lenses):
@@ -112,7 +112,8 @@ class CustomImages:
 
 
 def has_labels_file(folder: Path) -> bool:
-    """Whether a folder holds a user's own images rather than recorded rounds."""
+    """Return whether a folder has a `labels.csv`: it then holds a user's own pictures instead of
+    recorded rounds."""
     return (folder / LABELS).is_file()
 
 
@@ -123,12 +124,14 @@ def open_custom_images(
     *,
     skip_refused: bool = False,
 ) -> CustomImages:
-    """Read the labels and pictures of a folder, with the `copies` of each picture, for `camera`.
+    """Read the labels and pictures of a folder, and make the `copies` of each picture (kinds of
+    `mtlnet.data.picture_copies.COPIES`) as seen by `camera`.
 
     `camera`: the model's camera. Raises UserError with the line of `labels.csv` for a faulty row,
     for a picture that is missing, damaged or not of its camera's aspect ratio, and for a picture
-    that shows too little of the model's view. With `skip_refused`, pictures of the last kind are
-    listed in `refused` instead.
+    that shows too little of the model's view. With `skip_refused`, pictures that show too little of
+    the model's view are listed in `refused` instead; the error is raised only if no other picture
+    is left.
     """
     path = folder / LABELS
     pictures, labels = read_labels(path)
@@ -197,8 +200,8 @@ def _read_pictures(
 def picture_cameras(
     folder: Path, pictures: Sequence[LabelledPicture], model: CameraParameters
 ) -> list[CameraParameters | None]:
-    """Camera of each picture; None stands for the model's camera. Raises UserError for a faulty
-    camera file."""
+    """Return the camera of each picture; None stands for the model's camera, `model`. Raises
+    UserError for a faulty camera file."""
     known: dict[str, CameraParameters] = {}
     found: list[CameraParameters | None] = []
     for picture in pictures:

@@ -15,12 +15,12 @@ from trackfeatures.definitions import UNKNOWN_HEADING
 def describe_data(
     dataset: Dataset, frames: Frames, held_out: Frames | None = None
 ) -> dict[str, Any]:
-    """Description of a model's training data, for its model card.
+    """Return a description of a model's training data, `frames` of `dataset`, for its model card.
 
-    The entry `mean` has the mean labels; evaluations compare the model with the constant answer
-    `mean`. `held_out`: rounds on which only the uncertainty head was fitted. Their seeds and tracks
-    count as seen by the model, but the entry `frames` does not count their frames.
-    The format of the entries `split`, `held_out` and `seeds` is defined in
+    The entry `mean` has the mean labels, with which evaluations compare the model: they are the
+    constant answer of the baseline. `held_out`: frames of rounds on which only the uncertainty head
+    was fitted. Their seeds and tracks count as seen by the model, but the entry `frames` does not
+    count them. The format of the entries `split`, `held_out` and `seeds` is defined in
     `mtlnet.inference.trained_rounds`.
     """
     fitted = held_out.rounds if held_out is not None else []
@@ -42,7 +42,8 @@ def describe_data(
 
 
 def mean_labels(labels: LabelArrays) -> dict[str, Any]:
-    """Means of the labels in m and rad, their most frequent class, and the share of each class.
+    """Return the means of the labels in m and rad, their most frequent class, and the share of each
+    class.
 
     The mean of a marking that is never present is None.
     """
@@ -62,6 +63,6 @@ def mean_labels(labels: LabelArrays) -> dict[str, Any]:
 
 
 def nan_where_unknown(metres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`metres` with NaN in place of infinity, which stands for an unknown label
-    (`trackfeatures.coding`)."""
+    """Return `metres` with NaN in place of infinity, which stands for an unknown label
+    (`trackfeatures.coding`). The shape is kept."""
     return np.where(np.isinf(metres), np.nan, metres)

@@ -28,7 +28,8 @@ PREFETCH = 4  # batches whose labels are computed in advance
 @dataclass(frozen=True)
 class DeviceBatch:
     """A batch on the device: `images` uint8 (B, H, W, 3), coded targets `coded` (B, 6), classes
-    `heading` (B,), and labels of the road ahead `ahead` (B, A)."""
+    `heading` (B,), and labels of the road ahead `ahead` (B, A). A is 28, or 0 without auxiliary
+    heads."""
 
     images: Tensor
     coded: Tensor
@@ -37,7 +38,7 @@ class DeviceBatch:
 
 
 def on_device(batch: Batch | DeviceBatch, device: torch.device) -> DeviceBatch:
-    """The batch as tensors on `device`."""
+    """Copy the batch to `device` and return it as tensors. A DeviceBatch is returned unchanged."""
     if isinstance(batch, DeviceBatch):
         return batch
     arrays = (batch.images, batch.coded, batch.heading, batch.ahead)
@@ -66,7 +67,7 @@ class GpuDataset:
         ]
 
     def make(self, step: int) -> DeviceBatch:
-        """This process's part of batch number `step`."""
+        """Return this process's part of batch number `step`."""
         if self._augment is not None:
             return self._augmented(self._loader.make_labels(step), step)
         rows = self._to_device(self._loader.indices(step)[self._loader.rows])
@@ -75,7 +76,7 @@ class GpuDataset:
         )
 
     def batches(self, first: int) -> Iterator[DeviceBatch]:
-        """Yields batches `first`, `first` + 1, ... without end."""
+        """Yield batches `first`, `first` + 1, ... without end."""
         if self._augment is None:
             return map(self.make, count(first))
         labels = make_ahead(self._loader.make_labels, first, PREFETCH, PREFETCH)
@@ -116,10 +117,11 @@ def _decode(loader: Loader, device: torch.device, first_row: int) -> Tensor:
 def cache_if_it_fits(
     loader: Loader, device: torch.device, free_bytes: int | None = None, first_row: int = 0
 ) -> Loader | GpuDataset:
-    """The loader's frames, image rows from `first_row` on, in the memory of `device`.
+    """Copy the loader's frames, image rows from `first_row` on, to the memory of `device`, and
+    return them as a GpuDataset.
 
     Returns the loader itself if the frames do not fit, or if `device` is a CPU. `free_bytes`: free
-    memory of the device; None: the amount that the device reports.
+    memory of the device; None: the amount that the device reports. The frames may take 60 % of it.
     """
     if free_bytes is None:
         free_bytes = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0

@@ -4,7 +4,7 @@ A header names the columns, in any order: `file`, a path relative to the folder;
 `m`, `r`, distances in m, negative to the left, empty where the distance is absent; `angle`, rad,
 positive when the car points to the right of the track; `heading`, the class of the road: left,
 straight or right. `l`, `m`, `r` and `heading` can be `?` (unknown); an unknown label adds no loss
-and is not evaluated. Columns and cells of `OPTIONAL` can be missing.
+and is not evaluated. The columns in `OPTIONAL` can be left out, and their cells can be empty.
 """
 
 import csv
@@ -46,8 +46,8 @@ Cells = dict[str, str]
 
 @dataclass(frozen=True)
 class CustomLabels:
-    """Labels: `distances` (N, 5) m, NaN where absent, `UNKNOWN_M` where unknown; `angle` (N,) rad;
-    `heading` (N,) class, or `UNKNOWN_HEADING`."""
+    """Labels of N pictures: `distances` (N, 5) m, NaN where absent, infinity where unknown; `angle`
+    (N,) rad; `heading` (N,), the number of the class of the road, or `UNKNOWN_HEADING`."""
 
     distances: NDArray[np.float32]
     angle: NDArray[np.float32]
@@ -57,13 +57,13 @@ class CustomLabels:
         return len(self.angle)
 
     def take(self, rows: Any) -> "CustomLabels":
-        """The labels of the pictures in `rows`."""
+        """Return the labels of the pictures selected by `rows`: indices, a mask (N,) or a slice."""
         return CustomLabels(self.distances[rows], self.angle[rows], self.heading[rows])
 
 
 @dataclass(frozen=True)
 class LabelledPicture:
-    """One row of the file without its labels."""
+    """One row of `labels.csv` without its labels."""
 
     line: int
     file: str
@@ -87,7 +87,7 @@ class LabelledPicture:
 
 
 def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
-    """The pictures and labels of a `labels.csv`, at least one.
+    """Read a `labels.csv`; returns its pictures, at least one, and their labels.
 
     File names may contain bytes that are not UTF-8. Raises UserError with the line of a faulty row.
     """
@@ -111,7 +111,8 @@ def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
 
 
 def read_cells(path: Path) -> list[tuple[int, Cells]]:
-    """Line number and cells by column, without surrounding spaces, for each row.
+    """Read a `labels.csv`; returns, for each row, the line number and the cells by column, without
+    surrounding spaces.
 
     Raises UserError for a wrong header, a row with missing or surplus cells, and a repeated file.
     """
@@ -143,7 +144,8 @@ def read_cells(path: Path) -> list[tuple[int, Cells]]:
 
 
 def write_cells(path: Path, rows: list[Cells]) -> None:
-    """Replace a `labels.csv` by these rows, atomically; the file is synced to disk on return."""
+    """Replace a `labels.csv` by a file with the given rows, atomically; it is synced to disk on
+    return."""
     used = [name for name in OPTIONAL if any(row.get(name) for row in rows)]
     text = StringIO()
     writer = csv.DictWriter(text, (*COLUMNS, *used), restval="", lineterminator="\n")
@@ -153,7 +155,7 @@ def write_cells(path: Path, rows: list[Cells]) -> None:
 
 
 def check_cells(cells: Cells) -> None:
-    """Raise UserError with the reason if a row to be written is faulty."""
+    """Raise UserError with the reason if `cells`, a row that is to be written, is faulty."""
     try:
         _parse(0, {name: cells.get(name, "") for name in (*COLUMNS, *OPTIONAL)})
     except ValueError as error:
@@ -161,7 +163,7 @@ def check_cells(cells: Cells) -> None:
 
 
 def path_within(name: str) -> bool:
-    """Whether a name in a table is a path inside the table's folder."""
+    """Return whether `name`, read from a table, is a relative path inside the table's folder."""
     path = PurePosixPath(name)
     return bool(name) and name != UNKNOWN and not path.is_absolute() and ".." not in path.parts
 
@@ -269,11 +271,12 @@ def _number(name: str, text: str) -> float:
 
 
 def lane_cells(ml: float, mr: float) -> Cells:
-    """Cells of the five distances, from the distances (m) to the two markings of the car's lane.
+    """Return the cells of the five distances, from the signed distances `ml` and `mr` (m) to the
+    two markings of the car's lane.
 
-    As the features are defined, `ml` and `mr` are present at 0.5 m or more from both markings. At
-    more than 1.2 m from both there is no `m`; otherwise `m` is the nearer marking, and the marking
-    beyond it is unknown.
+    `ml` and `mr` are filled in if the car is at least 0.5 m from both markings. If it is more than
+    1.2 m from both, `l`, `m` and `r` are empty. Otherwise `m` is the nearer marking, `l` or `r` is
+    the marking at the lane's opposite side, and the marking beyond the nearer one is unknown.
     """
     near = min(-ml, mr)
     in_lane = near >= tf.IN_LANE_MARGIN_M
@@ -286,9 +289,10 @@ def lane_cells(ml: float, mr: float) -> Cells:
 
 
 def lane_sides(metres: Mapping[str, float | None]) -> tuple[float, float] | None:
-    """Distances (left, right), m, to two neighbouring markings, from the distances by marking.
+    """Return the signed distances (left, right), m, to the two markings of one lane, from the
+    distances by name of the marking.
 
-    They are `ml` and `mr`; where these are absent, `m` and `r`; where `r` is absent too, `l` and
+    The pair is `ml` and `mr`; where these are absent, `m` and `r`; where `r` is absent too, `l` and
     `m`. None if no pair is present.
     """
     for pair in (("ml", "mr"), ("m", "r"), ("l", "m")):

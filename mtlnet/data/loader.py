@@ -37,7 +37,7 @@ Made = TypeVar("Made")
 
 
 class LabelArrays(Protocol):
-    """Interface of the labels for training, which `datagen.recording.Labels` has."""
+    """Interface of the labels for training; `datagen.recording.Labels` implements it."""
 
     @property
     def distances(self) -> NDArray[np.float32]:
@@ -49,11 +49,11 @@ class LabelArrays(Protocol):
 
     @property
     def heading(self) -> NDArray[np.int64]:
-        """Classes (N,) of the road."""
+        """Numbers (N,) of the class of the road (`trackfeatures.RoadClass`)."""
 
 
 class Images(Protocol):
-    """Interface of labelled images, which `datagen.recording.Frames` has."""
+    """Interface of labelled images; `datagen.recording.Frames` implements it."""
 
     def __len__(self) -> int: ...
 
@@ -66,19 +66,20 @@ class Images(Protocol):
 
 
 class AheadLabels(Protocol):
-    """Interface of `mtlnet.data.road_ahead.RoadAhead`: labels of the road ahead."""
+    """Interface of the labels of the road ahead; `mtlnet.data.road_ahead.RoadAhead` implements
+    it."""
 
     def labels(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Labels (B, A) of B frames augmented with `params`; A =
-        `mtlnet.model.auxiliary.LABELS`."""
+        """Return the labels of the road ahead (B, A) of the frames `indices` (B,), augmented with
+        `params`. A is 28: 20 image columns (px) and 8 curvatures (1/m)."""
 
 
 @dataclass(frozen=True)
 class Batch:
     """A batch: `images` uint8 (B, H, W, 3), coded targets `coded` (B, 6), classes `heading` (B,),
-    `ahead` (B, A)."""
+    and labels of the road ahead `ahead` (B, A)."""
 
     images: NDArray[np.uint8]
     coded: NDArray[np.float32]
@@ -90,7 +91,8 @@ class Batch:
 
 @dataclass(frozen=True)
 class BatchLabels:
-    """A batch without images: rows of the frames, augmentation parameters, augmented labels."""
+    """A batch without its images. It has the rows of its frames, their augmentation parameters
+    (None without augmentation), and their labels after the augmentation."""
 
     chosen: NDArray[np.int64]  # (B,)
     params: AugmentParams | None
@@ -142,14 +144,14 @@ class Loader:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(self._epoch)
 
     def indices(self, step: int) -> NDArray[np.int64]:
-        """Rows of `frames` in the whole batch `step`."""
+        """Return the row numbers (batch,) of the frames of batch `step`, of all processes."""
         places = np.arange(step * self.batch, (step + 1) * self.batch)
         epochs, rows = np.divmod(places, len(self._epoch))
         parts = [self._permutation(e)[rows[epochs == e]] for e in np.unique(epochs).tolist()]
         return np.concatenate(parts)
 
     def make(self, step: int) -> Batch:
-        """This process's part of batch `step`."""
+        """Return this process's part of batch `step`."""
         labels = self.make_labels(step)
         images = self._buffers.take()
         self.frames.read_batch(labels.chosen, images)
@@ -158,7 +160,7 @@ class Loader:
         return Batch(images, labels.coded, labels.heading, labels.ahead)
 
     def make_labels(self, step: int) -> BatchLabels:
-        """This process's part of batch `step`, without its images."""
+        """Return this process's part of batch `step`, without its images."""
         chosen = self.indices(step)[self.rows]
         heading = self.heading[chosen]
         if not self.augment:
@@ -175,21 +177,21 @@ class Loader:
     def read_ahead(
         self, chosen: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Labels of the road ahead (B, A) for B frames augmented with `params`; see
-        `Batch.ahead`."""
+        """Return the labels of the road ahead (B, A) of the frames `chosen` (B,), augmented with
+        `params`; A is 0 if the loader has none."""
         if self._ahead is None:
             return np.zeros((len(chosen), 0), np.float32)
         return self._ahead.labels(chosen, params)
 
     def batches(self, first: int) -> Iterator[Batch]:
-        """Yields batches `first`, `first` + 1, ... without end, made in advance on threads."""
+        """Yield batches `first`, `first` + 1, ... without end, made in advance on threads."""
         return make_ahead(self.make, first, PREFETCH, WORKERS)
 
 
 def make_ahead(
     make: Callable[[int], Made], first: int, ahead: int, workers: int
 ) -> Generator[Made, None, None]:
-    """Yields make(first), make(first + 1), ... without end. `workers` threads compute `ahead`
+    """Yield make(first), make(first + 1), ... without end. `workers` threads compute up to `ahead`
     results in advance."""
     with ThreadPoolExecutor(workers, thread_name_prefix="loader") as pool:
         waiting = deque(pool.submit(make, first + i) for i in range(ahead))
@@ -216,7 +218,8 @@ class BufferPool:
         self._free: list[NDArray[np.uint8]] = []
 
     def take(self) -> NDArray[np.uint8]:
-        """A buffer as an array with arbitrary content."""
+        """Return a free buffer, or a new one if none is free, as an array with arbitrary
+        content."""
         try:
             memory = self._free.pop()
         except IndexError:

@@ -22,7 +22,8 @@ from trackfeatures.measurement import LineOffsets
 
 
 def model_labels(frames: Frames) -> Labels:
-    """Labels of `frames` in metres at the model's camera, `frames.camera`: the network's targets.
+    """Return the labels of `frames` in metres at the model's camera, `frames.camera`. They are the
+    targets of the network.
 
     The limits of the in-lane and the on-marking system are applied to these converted distances, so
     that the presence of a distance also follows from the picture alone.
@@ -37,7 +38,7 @@ def model_labels(frames: Frames) -> Labels:
 
 
 def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.float32]:
-    """A model's outputs (N, K) for `frames`, converted to metres of the recorded cars.
+    """Return a model's outputs (N, K) for `frames`, converted to metres of the recorded cars.
 
     `mtlnet.inference.prediction.split_outputs` explains the K columns.
     """
@@ -49,19 +50,21 @@ def car_outputs(outputs: NDArray[np.float32], frames: Frames) -> NDArray[np.floa
 
 
 def moved_rounds(frames: Frames) -> list[tuple[int, RoundInfo]]:
-    """Number and description of each round whose camera is mounted at another position than the
-    model's camera."""
+    """Return index and description of each round whose camera is mounted at another position than
+    the model's camera, `frames.camera`."""
     rounds = enumerate(frames.rounds)
     return [(n, info) for n, info in rounds if not _as_mounted(info.label_camera, frames.camera)]
 
 
 def round_rectification(info: RoundInfo, camera: CameraParameters) -> Rectification:
-    """Rectification from the camera with which a round was labelled to the model's `camera`."""
+    """Return the rectification from the camera with which the round `info` was labelled to the
+    model's `camera`."""
     return Rectification(info.label_camera, camera, any_height=True)
 
 
 def camera_scales(frames: Frames) -> NDArray[np.float64]:
-    """Metres at the model's camera per metre of the recorded car, for each of `frames` (N,)."""
+    """Return, for each of N frames, the metres at the model's camera per metre of the recorded car
+    (N,)."""
     rounds = (round_rectification(info, frames.camera) for info in frames.rounds)
     return np.array([1 / each.scale for each in rounds])[frames.labels.round]
 

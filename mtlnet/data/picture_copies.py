@@ -27,7 +27,8 @@ KINDS = {"mirrored": (MIRRORED,), "turned": tuple(TURNS_RAD)}
 
 
 def parse_copies(text: str) -> tuple[str, ...]:
-    """The kinds of copies that `text`, the value of `--copies`, names; `PLAIN` is always first.
+    """Return the kinds of copies named by `text`, the value of `--copies`, such as
+    "mirrored,turned". `PLAIN`, the picture as taken, is always the first.
 
     Raises UserError for an unknown word.
     """
@@ -39,7 +40,8 @@ def parse_copies(text: str) -> tuple[str, ...]:
 
 
 def copied_camera(camera: CameraParameters, copy: str) -> CameraParameters:
-    """The camera that would have taken the copy."""
+    """Return the camera that would have taken the copy of a picture taken by `camera`. `copy`: one
+    of `COPIES`."""
     if copy != MIRRORED:
         return camera
     matrix, coefficients = camera.matrix, list(camera.coefficients)
@@ -60,8 +62,8 @@ def copied_camera(camera: CameraParameters, copy: str) -> CameraParameters:
 def copied_picture(
     image: NDArray[np.uint8], camera: CameraParameters, copy: str
 ) -> NDArray[np.uint8]:
-    """The copy of a picture (H, W, 3) taken by `camera`. The picture can have any size of the
-    camera's aspect ratio."""
+    """Return the copy, of kind `copy` (one of `COPIES`), of a picture (H, W, 3) taken by `camera`.
+    The picture can have any size of the camera's aspect ratio, which the copy keeps."""
     if copy == PLAIN:
         return image
     if copy == MIRRORED:
@@ -94,7 +96,8 @@ def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) ->
 def copied_label(
     labels: CustomLabels, row: int, camera: CameraParameters, copy: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Distances (1, 5) in m, angle (1,) in rad and class (1,) of the copy of picture `row`."""
+    """Return distances (1, 5) in m, angle (1,) in rad and class (1,) of the copy, of kind `copy`,
+    of picture `row`, which was taken by `camera`."""
     one = labels.take([row])
     distances, angle, heading = one.distances, one.angle, one.heading
     if copy == MIRRORED:

@@ -2,10 +2,10 @@
 (`mtlnet.model.auxiliary`).
 
 The columns are the positions, in px from the left edge of the image, at which the two markings of
-the car's lane cross the image rows `ROWS`. They are computed from the polylines recorded with every
-image, and are NaN outside the image. The curvatures are those of the road at the distances
-`AHEAD_M` in front of the car, 1/m, positive to the left. They are read from the labels of all
-frames of the same track, and are NaN where no frame was recorded nearby.
+the car's lane cross the ten image rows `ROWS`. They are computed from the polylines recorded with
+every image, and are NaN outside the image. The curvatures, 1/m, positive to the left, are the
+road's curvatures at the eight distances `AHEAD_M`, 0 to 40 m in front of the car. They are read
+from the labels of all frames of the same track, and are NaN where no frame was recorded nearby.
 """
 
 from collections.abc import Sequence
@@ -53,8 +53,8 @@ within 8 m, 53 % within 4 m."""
 class RoadAhead:
     """Labels of the road ahead for frames, after augmentation of their images.
 
-    `keep`: read the polylines of all frames now, on all cores, and keep them in memory (0.5 kB per
-    frame).
+    `keep`: read the polylines of all frames when this object is made, on all cores, and keep them
+    in memory (0.5 kB per frame). Otherwise they are read for each batch.
     """
 
     def __init__(self, frames: Frames, camera: CameraParameters, *, keep: bool = False) -> None:
@@ -72,14 +72,16 @@ class RoadAhead:
     def labels(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Columns and curvatures as one row per frame (B, `mtlnet.model.auxiliary.LABELS`)."""
+        """Return the 20 columns (px) and 8 curvatures (1/m) of the frames `indices` (B,), whose
+        images were augmented with `params`, as one row per frame (B, 28)."""
         columns = self.columns(indices, params).reshape(len(indices), -1)
         return np.concatenate([columns, self.curvatures(indices, params)], 1)
 
     def columns(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Columns (B, 2, ROWS) in px of frames whose images were augmented with `params`."""
+        """Return the columns (B, 2, 10), px, of both markings in each of `ROWS`, for the frames
+        `indices` (B,), whose images were augmented with `params`."""
         points = self._read(indices) if self._kept is None else self._kept[indices]
         if params is None:
             return crossings(points, self._camera.width)
@@ -110,7 +112,8 @@ class RoadAhead:
     def curvatures(
         self, indices: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
-        """Curvatures (B, AHEAD_M) in 1/m of frames whose images were augmented with `params`."""
+        """Return the curvatures (B, 8), 1/m, at each of `AHEAD_M`, for the frames `indices` (B,),
+        whose images were augmented with `params`."""
         found = self._curvature[indices]
         return found if params is None else np.where(params.mirrored[:, None], -found, found)
 
@@ -128,8 +131,8 @@ def _annotations(path: Path) -> Messages:
 
 
 def lane_beside(frames: Frames) -> NDArray[np.float64]:
-    """Distances (N, 2) in m at the model's camera, negative to the left, to both markings of the
-    lane that the car is in or nearest to, whether or not the features are present."""
+    """Return the distances (N, 2), m at the model's camera, negative to the left, to both markings
+    of the lane that the car is in or nearest to, whether or not the features are present."""
     labels, rounds = frames.labels, frames.rounds
     width = np.array([info.lane_width_m for info in rounds])[labels.round]
     centre = width * (labels.lanes / 2 - labels.lane_index - 0.5)
@@ -143,11 +146,12 @@ def own_markings(
     camera: CameraParameters,
     out: NDArray[np.floating[Any]],
 ) -> None:
-    """Write the polylines (px) of the lane's two markings, found in `lines`, to `out` (2, POINTS,
-    2).
+    """Write the polylines (px) of the two markings of the car's lane, found in `lines`, to `out`
+    (2, 34, 2), which has room for 34 points of each.
 
-    `beside` (2,): distances to the markings, m, negative to the left. A polyline is assigned to a
-    marking by its near end, as if the road were level there; lanes are at least 2.7 m wide.
+    `lines`: polylines (points, 2), px; `beside` (2,): distances to the two markings, m, negative to
+    the left. A polyline is assigned to a marking by its near end, as if the road were level there;
+    lanes are at least 2.7 m wide.
     """
     nearest = np.full(SIDES, APART_M)
     drawn = [line for line in lines if len(line)]
@@ -166,8 +170,8 @@ def own_markings(
 def changed_points(
     points: NDArray[np.floating[Any]], params: AugmentParams, camera: CameraParameters
 ) -> NDArray[np.float64]:
-    """Positions (B, 2, POINTS, 2), px, of `points` of the same shape in the images augmented with
-    `params`."""
+    """Return the positions of `points` (B, 2, 34, 2), px, in the images augmented with `params`, in
+    the same shape."""
     moved = points.astype(np.float64)
     below = np.maximum(moved[..., 1] - horizon_row(camera), 0.0)
     moved[..., 0] += params.shift[:, None, None] * shear_per_metre(camera) * below
@@ -190,8 +194,8 @@ def _turned(camera: CameraParameters) -> NDArray[np.float64]:
 
 
 def crossings(points: NDArray[np.floating[Any]], width: int) -> NDArray[np.float32]:
-    """Columns (B, 2, ROWS), px, where polylines (B, 2, POINTS, 2) first cross the image rows
-    `ROWS`.
+    """Return the columns (B, 2, 10), px, where polylines (B, 2, points, 2) first cross the ten
+    image rows `ROWS`.
 
     NaN where a polyline does not cross the row, or crosses it outside an image of `width` px.
     """
@@ -216,11 +220,12 @@ def curvature_ahead(
     tracks: NDArray[np.str_],
     scale: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Curvatures (N, AHEAD_M) in 1/m in front of cars at `s` (N,) m with `curvature` (N,) there.
+    """Return the curvatures (N, 8), 1/m, of the road at the distances `AHEAD_M` in front of cars at
+    `s` (N,) m on `tracks` (N,), where the road's curvature is `curvature` (N,).
 
     `scale` (N,): metres at the model's camera, in which the result is given, per metre of the car.
     A track is the same in all its rounds, so the frames of all rounds are used; NaN where no frame
-    was recorded nearby.
+    was recorded within 2 m.
     """
     found = np.full((len(s), len(AHEAD_M)), np.nan, np.float32)
     for track in np.unique(tracks).tolist():
@@ -243,7 +248,8 @@ def hard_frames(
     heading: NDArray[np.int64],
     tracks: NDArray[np.str_],
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the frames in sharp bends, or near a point where the class of the road changes.
+    """Return a mask (N,) of the frames in bends with a radius under 80 m, or within 8 m of a point
+    where the class of the road changes.
 
     Most errors of a network occur in these frames. `s` (N,) m, `curvature` (N,) 1/m and `heading`
     (N,) are the labels; the points where the class changes are found from all frames of a track.
@@ -264,8 +270,8 @@ def hard_frames(
 
 
 def hard_frame_repeats(frames: Images, repeats: int) -> NDArray[np.int64] | None:
-    """Number of times (N,) that each frame is used in an epoch: `repeats` for the hard frames of
-    recorded rounds, 1 for other frames. None: every frame once."""
+    """Return the number of times (N,) that each frame is used in an epoch: `repeats` for the hard
+    frames of recorded rounds, 1 for other frames. None: every frame is used once."""
     if repeats == 1 or not isinstance(frames, Frames):
         return None
     labels = frames.labels

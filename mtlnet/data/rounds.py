@@ -20,7 +20,8 @@ MAX_NAMED = 5  # undecodable images named in a message
 
 
 def open_training_dataset(path: Path) -> Dataset:
-    """The dataset in folder `path`. Raises UserError when its images do not fit the network."""
+    """Open the dataset in folder `path`. Raises UserError when its images do not fit the network,
+    or when it has no train round."""
     dataset = Dataset.open(path)
     camera = dataset.camera
     if (camera.width, camera.height) != (WIDTH, HEIGHT):
@@ -40,7 +41,8 @@ def open_training_dataset(path: Path) -> Dataset:
 
 def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
     """Divide the train rounds of a dataset into rounds to train on and held-out rounds, on which
-    the uncertainty head is fitted. The latter are None if there are too few train rounds.
+    the uncertainty head is fitted. With fewer than eight train rounds, all are trained on, and the
+    second result is None.
 
     The division depends only on the set of rounds. The next held-out round is always the one whose
     track and lights are rarest among the rounds already held out.
@@ -60,7 +62,7 @@ def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
 
 
 def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
-    """The frames of the rounds with these ids."""
+    """Return the frames of the rounds whose ids are in `names`."""
     chosen = [i for i, info in enumerate(dataset.rounds) if info.id in names]
     return Frames(
         [dataset.rounds[i] for i in chosen], [dataset.indexes[i] for i in chosen], dataset.camera
@@ -83,7 +85,8 @@ def require_camera(card: ModelCard, camera: CameraParameters) -> None:
 
 
 def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
-    """The errors of all frames with a damaged image or label, by row; decodes every frame."""
+    """Decode every frame, and return the errors of the frames with a damaged image or label, by
+    row."""
     images = np.empty((CHUNK, frames.camera.height, frames.camera.width, 3), np.uint8)
     found: dict[int, UndecodableImage] = {}
     for first in range(0, len(frames), CHUNK):
@@ -103,9 +106,11 @@ def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
 
 
 def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) -> None:
-    """Decode all frames; raise DatasetError with the number and names of undecodable frames.
+    """Decode all frames; raise DatasetError with the number of undecodable frames and the names of
+    the first five.
 
-    `skippable`: the command has the option --skip-undecodable, which the message then mentions.
+    `data`: the dataset's folder, for the message. `skippable`: the command has the option
+    --skip-undecodable, which the message then mentions.
     """
     found = list(find_undecodable(frames).values())
     if not found:
@@ -120,7 +125,8 @@ def require_decodable(frames: Frames, data: Path, *, skippable: bool = False) ->
 
 
 def drop_undecodable(frames: Frames, data: Path) -> tuple[Frames, list[str]]:
-    """`frames` without the undecodable frames, and the names "ROUND/FRAME" of these frames.
+    """Decode all frames; returns `frames` without the undecodable frames, and the names
+    "ROUND/FRAME" of the undecodable frames.
 
     Raises DatasetError when no frame is left.
     """
