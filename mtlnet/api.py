@@ -203,9 +203,9 @@ class Model:
         prints.
 
         `data`: a folder of recorded rounds, or of pictures with a `labels.csv`. `split`: train,
-        test or unseen. `every`: use every n-th frame. `copies`: "mirrored,turned" also evaluates
-        mirrored and turned copies of pictures. `page`: an HTML file to write. Raises UserError for
-        data that cannot be read or do not fit the model.
+        test, unseen or all. `every`: use every n-th frame. `copies`: "mirrored,turned" also
+        evaluates mirrored and turned copies of pictures. `page`: an HTML file to write. Raises
+        UserError for data that cannot be read or do not fit the model.
         """
         from mtlnet.evaluation.evaluate import evaluate
 

@@ -43,11 +43,12 @@ def evaluate(
     """Evaluate a model on one split of a dataset; returns the report for all frames and by group
     (`mtlnet.evaluation.metrics`).
 
-    `engines`: the same model once per thread. `report(done, total)` is called after each chunk of
-    frames. `page`: an HTML file to write, or its folder; `worst`: a JPEG to write of the frames
-    with the largest errors. `every`: evaluate every n-th frame only, because consecutive frames are
-    similar. `copies`: value of `--copies` for a user's own pictures. Raises UserError when the data
-    do not fit the model.
+    `engines`: the same model once per thread. `data`: folder of a dataset, or of a user's own
+    pictures, which have no splits. `split`: train, test, unseen or all. `report(done, total)` is
+    called after each chunk of frames. `page`: an HTML file to write, or its folder; `worst`: a JPEG
+    to write of the frames with the largest errors. `every`: evaluate every n-th frame only, because
+    consecutive frames are similar. `copies`: value of `--copies`, for a user's own pictures. Raises
+    UserError when the data do not fit the model.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
@@ -97,8 +98,11 @@ def evaluate_custom_images(
     """Evaluate a model on a user's own pictures with a `labels.csv`; returns the report
     (`mtlnet.evaluation.pictures`).
 
-    `copies`: kinds of `mtlnet.data.picture_copies`. `page`: an HTML file to write. Pictures that
-    show too little of the model's view are only counted. Raises UserError for faulty files.
+    `report(done, total)` is called with numbers of pictures. `every`: evaluate every n-th picture
+    only. `copies`: kinds of copies of each picture to evaluate, from
+    `mtlnet.data.picture_copies.COPIES`. `page`: an HTML file to write. For pictures that show too
+    little of the model's view, the report has the number but no errors. Raises UserError for faulty
+    files.
     """
     engine = engines[0]
     images = open_custom_images(folder, engine.card.camera, copies, skip_refused=True)
@@ -119,7 +123,8 @@ def evaluate_custom_images(
 
 
 def about(engine: Engine) -> dict[str, Any]:
-    """Return the entries of a report that describe the model."""
+    """Return the entries of a report that describe the model: its name, the hash of its weights,
+    the engine and the precision."""
     return {
         "model": engine.card.name,
         "model_hash": engine.card.model_hash,
@@ -134,7 +139,8 @@ def predict_rounds(
     """Run the model on recorded rounds; returns outputs (N, K; columns: `split_outputs`), corrected
     for rounds whose camera is mounted at another position than the model's camera.
 
-    Raises DatasetError with the names of all undecodable images.
+    `data`: the dataset's folder, for messages; `report(done, total)` is called with numbers of
+    frames. Raises DatasetError, with the names of the first undecodable images, if there are any.
     """
     try:
         return car_outputs(predict_frames(engines, frames, report), frames)
@@ -151,8 +157,8 @@ def predict_frames(
     """Run the model on all frames, with one thread per engine; returns outputs (N, K; columns:
     `split_outputs`).
 
-    An engine computes one frame at a time, as in the service; on a GPU it computes `CHUNK` frames
-    at once.
+    An engine computes one frame at a time, as in the service; on a GPU it computes 32 frames at
+    once. `report(done, total)` is called after every 32 frames.
     """
     idle: SimpleQueue[tuple[Engine, NDArray[np.uint8]]] = SimpleQueue()
     for engine in engines:
@@ -179,8 +185,12 @@ def predict_frames(
 
 
 def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
-    """Raise ModelError when the camera differs, or when the model was trained on these rounds (only
-    for the splits test and unseen)."""
+    """Raise ModelError when the frames' camera differs from the model's camera, or when the card
+    does not describe the training data.
+
+    For the splits test and unseen, also when the model was trained on one of the rounds; for
+    unseen, also when it was trained on one of the tracks.
+    """
     require_camera(card, frames.camera)
     if "mean" not in card.data:
         raise ModelError(

@@ -34,7 +34,8 @@ Rows = list[list[str]]
 
 
 def page_file(path: Path) -> Path:
-    """Return the file of the page for `path`, a file or a folder; makes the folder."""
+    """Return the file to which the page is written: `path`, or `report.html` in it if `path` is a
+    folder. Makes the file's folder."""
     if path.is_dir():
         path = path / FILE_NAME
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,16 +43,23 @@ def page_file(path: Path) -> Path:
 
 
 def write_page(path: Path, report: dict[str, Any], frames: Frames, outputs: Any) -> Path:
-    """Write the page of a report of `mtlnet.evaluation.evaluate` to `path`, a file or a folder;
-    returns the file."""
+    """Write the HTML page of `report`, the result of `mtlnet.evaluation.evaluate`, and return its
+    file.
+
+    `path`: a file or a folder; `outputs`: the model's outputs (N, K; columns: `split_outputs`) for
+    `frames`.
+    """
     path = page_file(path)
     atomic_write(path, page(report, frames, outputs), fsync=True)
     return path
 
 
 def page(report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]) -> str:
-    """Return the HTML page of `report`, with charts and worst frames of the model's outputs (N, K;
-    columns: `split_outputs`) for `frames`."""
+    """Return the HTML page of `report`, with charts of offset and angle along the track, and the
+    frames with the largest errors.
+
+    `outputs`: the model's outputs (N, K; columns: `split_outputs`) for `frames`.
+    """
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     return render(
         "mtlnet.evaluation",
@@ -179,7 +187,8 @@ shown once."""
 
 @dataclass(frozen=True)
 class WorstFrame:
-    """The frame with the index `row`, in which `feature` has the signed `error` (m or rad)."""
+    """The frame with the index `row`, in which the error of `feature` is large. `error`: this error
+    with its sign, m or rad."""
 
     row: int
     feature: str
@@ -187,8 +196,12 @@ class WorstFrame:
 
 
 def worst_frames(errors: NDArray[np.float64], rounds: NDArray[np.int64]) -> list[WorstFrame]:
-    """Return the `WORST_PER_FEATURE` frames with the largest errors of each feature, at different
-    parts of the road, from `errors` (N, 7) and the frames' `rounds` (N,)."""
+    """Return the two frames with the largest errors of each feature. Frames of one round are at
+    least 40 frames apart, so that they show different parts of the road.
+
+    `errors` (N, 7) in the order of `FEATURES`, NaN where not evaluated; `rounds` (N,): index of
+    each frame's round.
+    """
     chosen: list[WorstFrame] = []
     for i in (5, 6, 0, 1, 3, 2, 4):
         sizes = np.abs(errors[:, i])
@@ -208,9 +221,12 @@ def worst_frames(errors: NDArray[np.float64], rounds: NDArray[np.int64]) -> list
 def worst_figures(
     frames: Frames, outputs: NDArray[np.float32], chosen: list[WorstFrame]
 ) -> Iterator[dict[str, Any]]:
-    """Yield for each chosen frame its image (truth green, prediction orange) and its caption.
+    """Yield for each frame in `chosen` its image, with true markings in green and predicted
+    markings in orange, and its caption. `outputs` (N, K; columns: `split_outputs`) are the outputs
+    for all `frames`.
 
-    Keys: `image`, RGB at twice the frame's size; texts `feature`, `error`, `note`, `place`.
+    The keys are `image`, RGB at twice the frame's size beside a view from above, and the texts
+    `feature`, `error`, `note` and `place`.
     """
     labels = frames.labels
     for worst in chosen:
@@ -256,7 +272,7 @@ CAPTION_PX = 48
 
 def write_worst_sheet(path: Path, frames: Frames, outputs: NDArray[np.float32]) -> Path:
     """Write the frames with the largest errors of each feature as one JPEG with captions; returns
-    `path`."""
+    `path`. `outputs`: the model's outputs (N, K; columns: `split_outputs`) for `frames`."""
     errors = signed_errors(outputs, frames.labels.distances, frames.labels.angle)
     figures = list(worst_figures(frames, outputs, worst_frames(errors, frames.labels.round)))
     height, width = frames.camera.height, frames.camera.width

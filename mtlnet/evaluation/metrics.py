@@ -25,8 +25,8 @@ CALIBRATION_BINS = 10
 
 
 def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> NDArray[np.float64]:
-    """Return the errors (N, 7), in the order of `FEATURES`, m and rad, of a model's outputs (N, K;
-    columns: `split_outputs`). `distances` (N, 5) and `angle` (N,) are the labels.
+    """Return the errors (N, 7) of a model's outputs (N, K; columns: `split_outputs`), m and rad, in
+    the order of `FEATURES`. `distances` (N, 5), m, and `angle` (N,), rad, are the labels.
 
     The error of a marking is the error of the predicted value, even if the value decodes to
     "inactive". `to_lane_centre` has an error where both label and prediction have a value.
@@ -38,8 +38,11 @@ def signed_errors(outputs: NDArray[np.float32], distances: Any, angle: Any) -> N
 
 
 def error_percentiles(errors: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:
-    """Return, for each feature by name, mean, median, 95th and 99th percentile of the absolute
-    error, and the number of frames, from `errors` (N, 7)."""
+    """Return, for each feature by name, the mean, the median, and the 95th and 99th percentile of
+    the absolute error (m or rad), and the number of frames that have an error.
+
+    `errors` (N, 7): in the order of `FEATURES`, NaN where not evaluated.
+    """
     return {name: _percentiles(np.abs(errors[:, i])) for i, name in enumerate(FEATURES)}
 
 
@@ -55,7 +58,8 @@ def _percentiles(sizes: NDArray[np.float64]) -> dict[str, float | None]:
 def confusion(
     heading: NDArray[np.int64], predicted: NDArray[np.int64]
 ) -> dict[str, dict[str, int]]:
-    """Count the frames by true class and predicted class: {true: {predicted: count}}."""
+    """Count the frames by true class `heading` (N,) and `predicted` class (N,); returns {true name:
+    {predicted name: count}}. Frames of unknown class are not counted."""
     known = heading != UNKNOWN_HEADING
     heading, predicted = heading[known], predicted[known]
     names = [kind.name.lower() for kind in tf.RoadClass]
@@ -81,8 +85,8 @@ def coverage(std: NDArray[Any], errors: NDArray[Any]) -> dict[str, list[float | 
 def calibration(
     std: NDArray[Any], errors: NDArray[np.float64]
 ) -> dict[str, list[dict[str, float]]]:
-    """Compare predicted standard deviations (N, 7) with errors (N, 7): for each feature by name,
-    bins of equal count in the order of the standard deviation.
+    """Compare predicted standard deviations (N, 7) with errors (N, 7). For each feature by name,
+    the frames are sorted by predicted standard deviation and divided into ten bins of equal count.
 
     Each bin has the root mean square of the predicted standard deviations ("said"), the root mean
     square of the errors ("found"), and the number of frames.
@@ -161,7 +165,8 @@ def _by_range(
 def evaluate_outputs(
     outputs: NDArray[np.float32], labels: LabelArrays, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the report on a model's `outputs` (N, K; columns: `split_outputs`) for `labels`.
+    """Return the report on a model's `outputs` (N, K; columns: `split_outputs`) for `labels`: mean
+    absolute errors, percentiles, confusion of classes, losses, and the errors of the baseline.
 
     `mean`: the means of the training labels (`mtlnet.data.description.mean_labels`). The report has
     the key `uncertainty` when the model predicts standard deviations.
@@ -195,8 +200,8 @@ def evaluate_outputs(
 def evaluate_by_groups(
     outputs: NDArray[np.float32], frames: Frames, mean: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the report on all frames; under `by_track` and the other keys of `GROUPS` it has a
-    report for each group of frames.
+    """Return the report of `evaluate_outputs` on all frames, extended by a report for each group of
+    frames, under `by_track` and the other keys of `GROUPS`.
 
     `outputs` (N, K; columns: `split_outputs`); `mean`: the means of the training labels.
     """
@@ -227,7 +232,8 @@ def _means(errors: NDArray[np.float64], right: NDArray[np.bool_]) -> dict[str, A
 
 
 def feature_mean(means: dict[str, Any], name: str) -> float | None:
-    """Return the mean error of feature `name` in a report, or in its `baseline` or `ratio`."""
+    """Return the mean absolute error of feature `name` in `means`, a report or its entry
+    `baseline`, or the ratio in its entry `ratio`. None if no frame has this error."""
     keys = {"to_lane_centre": "to_lane_centre_mae_m", "angle": "angle_mae_rad"}
     found: float | None = means[keys[name]] if name in keys else means["mae_m"][name]
     return found
@@ -243,9 +249,10 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
 def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float | None]:
     """Return the losses of the paper's table, on coded values, including inactive distances.
 
-    `distance`, `angle`: mean over the frames of the squared error, summed over the five distances,
-    as in training; `distance_absolute`, `angle_absolute`: the same with the absolute error; `type`:
-    cross-entropy of the class, None where no frame has a known class.
+    `distance`: the squared errors of the five distances, summed as in training, mean over the
+    frames; `angle`: the mean squared error of the angle; `distance_absolute`, `angle_absolute`: the
+    same with absolute errors; `type`: cross-entropy of the class, None where no frame has a known
+    class.
     """
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
     known = ~np.isnan(target)

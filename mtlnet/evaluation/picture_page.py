@@ -47,7 +47,8 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Case:
-    """A picture or copy on the page. `row`: its index in the answers; None if it was refused."""
+    """A picture or copy on the page. `row`: its index in the answers; None if the picture was
+    refused."""
 
     picture: LabelledPicture
     copy: str
@@ -128,8 +129,9 @@ def _groups(figures: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def cases(answers: Answers) -> list[Case]:
     """Return all pictures and copies, failures first.
 
-    The order: refused pictures, absent answers, then all other pictures by their largest error. For
-    this comparison an error is divided by the mean error of its feature.
+    Refused pictures come first, then pictures whose lane is answered as absent, then all other
+    pictures by their largest error. For this comparison an error is divided by the mean error of
+    its feature.
     """
     images = answers.images
     sizes = np.abs(answers.errors)
@@ -205,6 +207,7 @@ def _drawn(answers: Answers, case: Case) -> Image:
 
 
 def source_camera(images: CustomImages, row: int) -> CameraParameters:
-    """Return the camera of the picture or copy with the index `row`, at the camera's own size."""
+    """Return the camera of the picture or copy with the index `row`, with the size that its camera
+    file states."""
     lens = images.lenses[row]
     return images.camera if lens is None else lens.source

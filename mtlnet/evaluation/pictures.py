@@ -47,24 +47,25 @@ class Answers:
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """Answer minus label (N, 5)."""
+        """Errors (N, 5), answer minus label, in the order of `FEATURES`, m and rad; NaN where
+        either has no value."""
         return self.found - self.true
 
     @property
     def absent(self) -> NDArray[np.bool_]:
-        """Whether the lane is labelled but answered as absent (N,)."""
+        """Mask (N,) of the pictures whose lane is labelled but answered as absent."""
         return np.isfinite(self.true[:, 0]) & np.isnan(self.found[:, 0])
 
     @property
     def foreign(self) -> NDArray[np.bool_] | None:
-        """Whether the answer is flagged as out of distribution (N,); None for a model without the
-        flag."""
+        """Mask (N,) of the pictures that the model flags as out of distribution; None for a model
+        without this flag."""
         score = split_outputs(self.outputs).ood_score
         return None if score is None else ~(score <= 1)
 
     @property
     def label_std(self) -> NDArray[np.float64]:
-        """Standard deviations of the labels (N, 7), in the order of
+        """Standard deviations of the labels (N, 7), m and rad, in the order of
         `mtlnet.inference.prediction.FEATURES`."""
         stds = [[p.std_m] * 6 + [p.std_rad] for p in self.images.pictures]
         return np.array(stds, np.float64)
@@ -74,7 +75,8 @@ def judge(
     images: CustomImages, outputs: NDArray[np.float32], trained: Sequence[str] = ()
 ) -> Answers:
     """Convert the model's outputs (N, K; columns: `split_outputs`) for the rectified images to
-    answers at the pictures' own cameras. `trained`: hashes of the pictures of the training."""
+    answers at the pictures' own cameras. `trained`: SHA-256 of the picture files that the model was
+    trained on."""
     outputs = images.outputs(outputs)
     distances, angle = tf.decode(outputs[:, :6])
     labels = images.labels
@@ -127,7 +129,7 @@ def _pictures(answers: Answers) -> list[LabelledPicture]:
 
 def group_of(answers: Answers, name: str, picture: LabelledPicture, copy: str) -> str:
     """Return the name of the group to which a picture belongs in the grouping `name`, a key of
-    `GROUPS`. `copy`: whether it is the picture as taken, mirrored or turned."""
+    `GROUPS`. `copy`: kind of copy, one of `mtlnet.data.picture_copies.COPIES`."""
     if name == "by_copy":
         return copy
     if name == "by_training":

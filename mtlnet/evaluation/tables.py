@@ -20,15 +20,16 @@ DIGITS = {name: 4 if name == "angle" else 3 for name in FEATURES}
 
 
 def error_cells(result: dict[str, Any], name: str) -> list[str]:
-    """Return the cells of a feature's errors: mean, median, 95th and 99th percentile, error of the
-    baseline (the training mean), ratio of the mean error to it."""
+    """Return the six table cells of the errors of feature `name` in `result`: mean, median, 95th
+    and 99th percentile, mean error of the baseline (the training mean), and ratio of the two mean
+    errors."""
     baseline, ratio = (feature_mean(result[part], name) for part in ("baseline", "ratio"))
     sizes = [*(result["errors"][name][k] for k in ("mean", "median", "p95", "p99")), baseline]
     return [*(format_number(v, DIGITS[name]) for v in sizes), format_number(ratio, 2)]
 
 
 def mean_error_cells(result: dict[str, Any]) -> list[str]:
-    """Return a cell with the mean error of each feature."""
+    """Return seven table cells, each with the mean error of one of `FEATURES`."""
     return [format_number(result["errors"][f]["mean"], DIGITS[f]) for f in FEATURES]
 
 
@@ -85,7 +86,8 @@ def _percent(stated: float | None) -> str:
 
 
 def group_table(result: dict[str, Any]) -> Table:
-    """Make the table of mean absolute errors by track, lane count, light, shadow, bend, speed."""
+    """Make the table of mean absolute errors in groups of frames: by track, lane count, light,
+    shadow, radius of the bend, and speed."""
     table = Table(title="by groups (m, rad)", box=None, padding=(0, 0, 0, 1))
     short = ("centre" if name == "to_lane_centre" else name for name in FEATURES)
     for column in ("", "frames", *short, "class"):
