@@ -1,9 +1,9 @@
 """`mtlnet export --model RUN --format onnx|openvino --precision f32|bf16|int8`.
 
-With f32 the weights stay as trained. With bf16 large weights are stored in bf16, and the graph
-converts them to float32. int8 is possible for OpenVINO only (`mtlnet.export.int8`); the engine uses
-an int8 graph by default if it has passed its accuracy gate on the test rounds. Each export is
-compared with torch on frames of a dataset.
+With f32 the weights stay as trained. With bf16 large weights (arrays of at least 256 values) are
+stored in bf16, and the graph converts them to float32. int8 is possible for OpenVINO only
+(`mtlnet.export.int8`); the engine uses an int8 graph by default if it has passed its accuracy gate
+on the test rounds. Each export is compared with torch on frames of a dataset.
 
 ONNX and OpenVINO models take any number of images at once (first axis, "batch") and give the same
 answers as for single images. The int8 graph takes one image, as the engine does, because a graph
@@ -69,10 +69,13 @@ def export_model(
     out: Path | None = None,
     frames: int = 64,
 ) -> dict[str, Any]:
-    """Write the model of `run` in another format and check it; returns the result of `--json`.
+    """Write the model of `run` in another format and compare it with torch; returns the result of
+    `--json`.
 
-    The result is compared with torch on `frames` frames of the dataset `data`, by default the
-    training data. Raises UserError for an unsupported export, ModelError when the result differs.
+    `kind`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". The comparison uses `frames`
+    frames of the dataset `data`, by default the training data; for int8 they are test rounds.
+    `out`: the folder to write. Raises UserError for an unsupported export, ModelError when an f32
+    export differs by more than the tolerance.
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
@@ -154,7 +157,8 @@ def _require_supported(kind: str, precision: str, out: Path | None, frames: int)
 
 
 def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about: Any) -> None:
-    """Write the `export.json` of the export in `folder`, with the hashes of its files."""
+    """Write the `export.json` of the export in `folder`. It has the hash of the model, the hashes
+    of the files `names`, and the entries `about`."""
     files = {name: file_hash(folder / name) for name in names}
     content = {"model_hash": card.model_hash, "files": files, **about}
     write_json(folder / EXPORT_FILE, content)
@@ -163,7 +167,8 @@ def write_export(folder: Path, card: ModelCard, names: tuple[str, ...], **about:
 class OnnxNetwork(ServedNetwork):
     """A network without uncertainty head, from uint8 images (B, H, W, 3) to its outputs (B, 9).
 
-    With heads over bins there is a second result (B, 5): probabilities that each marking is absent.
+    With heads over bins there is a second result (B, 5): the probabilities that the markings are
+    absent.
     """
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:  # type: ignore[override]
@@ -174,7 +179,8 @@ class OnnxNetwork(ServedNetwork):
 
 
 def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]:
-    """Write `model.onnx`, one file; returns its name. `bf16`: large weights are stored in bf16."""
+    """Write `model.onnx` to `folder`; returns its name as a tuple. `bf16`: large weights are stored
+    in bf16."""
     import onnx
 
     images = torch.zeros((2, HEIGHT, WIDTH, 3), dtype=torch.uint8)  # torch would fix a size of 1
@@ -206,7 +212,8 @@ def write_onnx(network: Network, folder: Path, *, bf16: bool) -> tuple[str, ...]
 
 
 def store_onnx_bf16(model: Any) -> None:
-    """Store large float32 weights of an ONNX model in bf16, with casts to float32 (in place)."""
+    """Change an `onnx.ModelProto` in place: its large float32 weights are stored in bf16, with
+    casts back to float32."""
     import ml_dtypes
     import onnx
     from onnx import helper, numpy_helper
@@ -225,8 +232,8 @@ def store_onnx_bf16(model: Any) -> None:
 
 
 def write_openvino(model: Any, folder: Path, precision: str) -> tuple[str, ...]:
-    """Write the files of an OpenVINO model; returns their names. With the `precision` bf16, large
-    weights are stored in bf16."""
+    """Write the files of `model`, an `openvino.Model`, to `folder`; returns their names. With the
+    `precision` bf16, large weights are stored in bf16."""
     import openvino
 
     model.inputs[0].get_node().set_layout(openvino.Layout("[batch,height,width,colour]"))

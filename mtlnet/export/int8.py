@@ -2,11 +2,11 @@
 
 The weights of all convolutions and of all shared layers except the last are quantised. The
 activations of most convolutions are quantised too, calibrated on training frames. Greedy forward
-selection chooses the convolutions that keep float activations, until the gate is passed on train
-rounds that were held out of the training (for another dataset: on a twelfth of its train rounds).
-The gate itself uses the test rounds, on which nothing is chosen. The fully connected layers are
-memory-bound. The last one is small but loses as much accuracy in int8 as the other two together, so
-it stays in float.
+selection chooses the convolutions that keep float activations, until the errors grow by at most
+half the gate's limits on train rounds that were held out of the training (for another dataset: on a
+twelfth of its train rounds). The gate itself uses the test rounds, on which nothing is chosen. The
+fully connected layers are memory-bound. The last one is small but loses as much accuracy in int8 as
+the other two together, so it stays in float.
 """
 
 import logging
@@ -44,7 +44,7 @@ LIMITS = {"distance_m": 0.003, "angle_rad": 0.0002, "accuracy": 0.001}
 
 
 def calibration_images(train: Frames) -> NDArray[np.uint8]:
-    """Read evenly spaced frames (N, H, W, 3) of the train rounds."""
+    """Read 300 evenly spaced frames (N, H, W, 3) of the train rounds, or all if there are fewer."""
     count = min(CALIBRATION_FRAMES, len(train))
     return train.read_batch(np.linspace(0, len(train) - 1, count).astype(np.int64))
 
@@ -52,13 +52,15 @@ def calibration_images(train: Frames) -> NDArray[np.uint8]:
 def choose_float_activations(
     model: Any, images: NDArray[np.uint8], held_out: Frames, mean: dict[str, Any]
 ) -> tuple[int, ...]:
-    """Choose the convolutions that keep float activations, on held-out train rounds.
+    """Choose the convolutions that keep float activations, on held-out train rounds; returns their
+    indices in topological order.
 
-    `images` (N, H, W, 3): frames for the calibration; `mean`: means of the training labels. Returns
-    the first choice that stays within `MARGIN` of the gate's limits on the held-out rounds, or else
-    the choice nearest to that. The order: no convolution; each convolution alone, from the fewest
-    multiplications up; the best of these with each other convolution; and so on. A network with too
-    many convolutions gets `FLOAT_ACTIVATIONS`.
+    `model`: an `openvino.Model`; `images` (N, H, W, 3): frames for the calibration; `mean`: means
+    of the training labels. The choices are tried in this order: no convolution; each convolution
+    alone, from the fewest multiplications up; the best of these with each other convolution; up to
+    three convolutions. The first choice with which no error grows by more than half its limit
+    (`LIMITS`) is returned; if there is none, the choice with the smallest growth. For a network
+    with more than 16 convolutions, nothing is tried and `FLOAT_ACTIVATIONS` is returned.
     """
     rows = np.linspace(0, len(held_out) - 1, min(HELD_OUT_FRAMES, len(held_out))).astype(np.int64)
     frames, labels = held_out.read_batch(rows), model_labels(held_out).take(rows)
@@ -85,7 +87,8 @@ def choose_float_activations(
 
 
 def convolutions_by_work(model: Any) -> list[int]:
-    """Return the numbers of a model's convolutions, from the fewest multiplications up."""
+    """Return the indices, in topological order, of the convolutions of an `openvino.Model`, sorted
+    from the fewest multiplications up."""
     operations = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
     work = [
         int(np.prod(list(op.get_output_shape(0))[2:])) * int(np.prod(list(op.get_input_shape(1))))
@@ -97,9 +100,11 @@ def convolutions_by_work(model: Any) -> list[int]:
 def quantise(
     model: Any, images: NDArray[np.uint8], float_activations: Sequence[int] = FLOAT_ACTIVATIONS
 ) -> Any:
-    """Quantise an OpenVINO model to int8, calibrated on `images` (N, H, W, 3).
+    """Quantise an `openvino.Model` to int8, calibrated on `images` (N, H, W, 3); returns the new
+    model.
 
-    `float_activations`: numbers of the convolutions whose activations are not quantised.
+    `float_activations`: indices, in topological order, of the convolutions whose activations stay
+    in float.
     """
     # Otherwise NNCF sends usage statistics.
     os.environ["NNCF_CI"] = "1"
@@ -122,24 +127,26 @@ def quantise(
 
 
 def operation_names(model: Any, kind: str) -> list[str]:
-    """Return the names of a model's operations of type `kind`, in topological order."""
+    """Return the names of the operations of type `kind` (such as "Convolution") of an
+    `openvino.Model`, in topological order."""
     operations = model.get_ordered_ops()
     return [op.get_friendly_name() for op in operations if op.get_type_name() == kind]
 
 
 def float_weights(model: Any) -> list[str]:
-    """Return the names of the MatMuls whose weights are not quantised: the last shared layer, and
-    all that are no shared layers."""
+    """Return the names of the MatMul operations of an `openvino.Model` whose weights are not
+    quantised: the last shared layer, the heads, and all others outside the shared layers."""
     products = operation_names(model, "MatMul")
     shared = [name for name in products if ".shared." in name]
     return [name for name in products if name not in shared[:-1]]
 
 
 def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
-    """Return the names of the operations whose activations are not quantised.
+    """Return the names of the operations of an `openvino.Model` whose activations are not
+    quantised.
 
-    These are the `chosen` convolutions, and all operations that no convolution depends on: shared
-    layers, heads and texture features.
+    These are the convolutions with the indices `chosen`, and all operations whose results do not
+    enter a convolution: shared layers, heads, and the texture features of the uncertainty head.
     """
     convolutions = operation_names(model, "Convolution")
     before = set(convolutions)
@@ -157,9 +164,11 @@ def float_operations(model: Any, chosen: Sequence[int]) -> list[str]:
 
 
 def judge(run: Path, data: Path) -> dict[str, Any]:
-    """Evaluate a run's int8 graph on the test rounds of a dataset; returns the result of the gate.
+    """Evaluate a run's int8 graph on the test rounds of the dataset `data`, and compare it with
+    float32; returns the result of `gate`.
 
-    It also has "native_int8": whether the processor of this evaluation multiplies int8 natively.
+    The result also has "native_int8": whether the processor of this evaluation multiplies int8
+    natively.
     """
 
     def evaluated(precision: Literal["f32", "int8"]) -> dict[str, Any]:
@@ -173,9 +182,10 @@ def gate(reference: dict[str, Any], quantised: dict[str, Any]) -> dict[str, Any]
     """Compare the evaluation of a quantised model with the float32 evaluation on the same frames.
 
     The result has the keys "passed", "failed" (names of features), "split", "frames", "limits" and
-    "worse" (increase of the mean error of each feature). The increase for a marking or for the
-    offset from the lane centre is limited by LIMITS["distance_m"]. A feature without labels is not
-    judged. A feature fails if only one of the evaluations has an error for it.
+    "worse" (increase of the mean error of each feature). The limits are `LIMITS`: 0.003 m for a
+    marking and the offset from the lane centre, 0.0002 rad for the angle, and 0.001 for the share
+    of wrong classes. A feature without labels is not judged. A feature fails if only one of the
+    evaluations has an error for it.
     """
     pairs = {
         **{name: (reference["mae_m"][name], value) for name, value in quantised["mae_m"].items()},

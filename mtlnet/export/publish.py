@@ -68,13 +68,14 @@ def publish(
     provenance: Provenance | None = None,
     uncertainty: FittedUncertainty | None = None,
 ) -> ModelCard:
-    """Fold `network`, write weights, graph, uncertainty head and card to the folder `run`, and
-    return the card.
+    """Write the finished model to the folder `run`: weights with batch normalisation folded into
+    them, graph, uncertainty head and card. Returns the card.
 
-    `images` (N, 210, 280, 3): frames on which the graph is compared with torch. Without
-    `uncertainty` the model predicts no standard deviations. Without OpenVINO the run gets no graph,
-    and nothing is compared. Raises ModelError when the graph differs by more than the tolerances of
-    `mtlnet.model.openvino_graph`. After an error the run has the model that it had before.
+    `images` (N, 210, 280, 3): frames on which the graph is compared with torch. `provenance`:
+    settings and data for the card. Without `uncertainty` the model predicts no standard deviations.
+    Without OpenVINO the run gets no graph, and nothing is compared. Raises ModelError when the
+    graph differs by more than the tolerances of `mtlnet.model.openvino_graph`. After an error the
+    run has the model that it had before.
     """
     folded = fold(network)
     weights = {name: t.contiguous() for name, t in folded.state_dict().items()}
@@ -110,10 +111,12 @@ def write_model(
     *,
     narrow: bool = False,
 ) -> dict[str, str]:
-    """Write weights, graph and uncertainty head of a folded `network` to `folder`; returns the hash
-    of each file.
+    """Write a model's weights, graph and uncertainty `head` to `folder`; returns the SHA-256 of
+    each file by its name.
 
-    Without OpenVINO no graph is written. `narrow`: the graph stores float16 weights in float16.
+    `network`: name of the architecture; `weights`: tensors by name, with batch normalisation
+    folded. Without OpenVINO no graph is written. `narrow`: weights that are float16 are stored as
+    float16 in the graph too, not as float32.
     """
     names: tuple[str, ...] = MODEL_FILES if has_openvino() else (WEIGHTS,)
     atomic_write(folder / WEIGHTS, save(weights), fsync=True)
@@ -127,7 +130,8 @@ def write_model(
 
 
 def golden_outputs(network: Network) -> tuple[float, ...]:
-    """Return the outputs (9,) of a folded network for the golden image, a fixed test image."""
+    """Return the nine outputs of a network, whose batch normalisation is folded, for the golden
+    image, a fixed test image."""
     images = golden_image(WIDTH, HEIGHT)[None]
     return tuple(map(float, predict_images(network, images)[0]))
 
@@ -158,12 +162,12 @@ def export_text(check: Mapping[str, float]) -> str:
 def compare_graph(
     network: Network, run: Path, images: NDArray[np.uint8], head: UncertaintyHead | None = None
 ) -> dict[str, float]:
-    """Return the largest differences, over `images` (N, H, W, 3), between torch in float32 and the
-    run's graph, by precision.
+    """Compare the graph in the folder `run` with torch in float32 on `images` (N, H, W, 3). Returns
+    the number of frames and, for each precision of the graph, the largest differences.
 
     `openvino_PRECISION_max`: absolute, of the nine outputs and the probabilities of absence;
     `openvino_PRECISION_uncertainty`: relative, of the uncertainty head's outputs. The difference of
-    an out-of-distribution score is relative to at least `LEAST_OOD_SCORE`.
+    an out-of-distribution score is divided by at least 0.001, because a score can be 0.
     """
     with torch.inference_mode():
         expected = ServedNetwork(network, head)(torch.from_numpy(images)).numpy()
@@ -190,7 +194,8 @@ def compare_graph(
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that make a model."""
+    """Return the versions of Python and of the packages on which a model's values depend, by
+    name."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

@@ -44,11 +44,12 @@ CHECK_IMAGES = 4
 
 
 def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]:
-    """Write the model of `run` to the new folder `out`; returns the result of `--json`.
+    """Write the model of `run` to the folder `out`; returns the result of `--json`.
 
     `data`: a dataset on which the uncertainty head is fitted again (`refit_uncertainty_head`).
-    Raises UserError when `out` has a model already, ModelError when the answers differ from the
-    run's by more than the rounding of the weights.
+    Raises UserError when `out` has a model already, ModelError when the written graph differs from
+    torch with the same weights by more than the tolerance. The difference from the unrounded model
+    is only part of the result.
     """
     card = read_card(run)
     if (out / CARD).exists():
@@ -81,7 +82,8 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
 
 
 def half(name: str, values: Tensor) -> Tensor:
-    """Return the weights `values` in float16. Raises ModelError when one is outside its range."""
+    """Return the weights `values` in float16. Raises ModelError, with the tensor's `name`, when a
+    weight is beyond the range of float16."""
     rounded = values.half()
     if not rounded.isfinite().all():
         raise ModelError(f"{name} holds a weight beyond float16's range: train the model anew")
