@@ -15,8 +15,8 @@ MAX_BOXES = 10_000
 
 
 def read_header(body: bytes) -> tuple[int, int, int]:
-    """Width and height in px as stored, and the EXIF orientation, 1 to 8, of an AVIF file. Raises
-    ImageError for an incomplete header."""
+    """Read an AVIF file's header; returns width and height in px as stored, and the orientation as
+    in EXIF, 1 to 8. Raises ImageError for an incomplete header."""
     try:
         return _primary(memoryview(body))
     except (IndexError, KeyError):

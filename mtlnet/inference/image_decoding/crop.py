@@ -16,7 +16,7 @@ TOLERANCE = 0.01  # of width and height, for rounding to whole pixels and small 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A rectangle of an image, px."""
+    """A rectangle of an image, px; `left` and `top` are its first column and row."""
 
     left: int
     top: int
@@ -27,12 +27,12 @@ class Box:
 def crop_box(
     width: int, height: int, view: CameraParameters, fov_y_deg: float | None = None
 ) -> Box | None:
-    """The part of an image of `width` x `height` px that the camera `view` shows; None for the
-    whole image.
+    """Return the part of an image of `width` x `height` px that the camera `view` shows; None if it
+    is the whole image.
 
-    `fov_y_deg`: vertical field of view of the image, degrees; None: that of `view`. A pinhole
-    camera of focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image shows less
-    than `view`.
+    `fov_y_deg`: vertical field of view of the image, degrees; None: the field of view of `view`. A
+    pinhole camera of focal length f px shows 2 f tan(fov/2) px. Raises ImageError when the image
+    shows less than `view`.
     """
     ratio = 1.0
     if fov_y_deg is not None:

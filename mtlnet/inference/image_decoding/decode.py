@@ -53,8 +53,8 @@ MAX_TRAILING_BYTES = 64  # some cameras add padding; more bytes could be another
 class ImageHeader:
     """Header of an image: `width` and `height` of the upright image, px.
 
-    `png_header` is set for a PNG. `scans`: number of scans of a JPEG; if the JPEG is not `checked`,
-    the usual number for its kind. `orientation`: as in EXIF, 1 to 8.
+    `png_header` is set for a PNG. `scans`: number of scans of a JPEG; as long as its structure is
+    not `checked`, the usual number for a JPEG of its kind. `orientation`: as in EXIF, 1 to 8.
     """
 
     width: int
@@ -78,7 +78,7 @@ class ImageHeader:
 
 
 def read_whole_image(path: Path) -> NDArray[np.uint8]:
-    """The image file at `path` as uint8 RGB (H, W, 3).
+    """Read the image file at `path`; returns upright uint8 RGB (H, W, 3).
 
     Raises ImageError for an image that cannot be used, UserError for a file that is missing or too
     large.
@@ -108,7 +108,8 @@ def _read_file(path: Path) -> bytes:
 
 
 def decode_file(body: bytes) -> NDArray[np.uint8]:
-    """The image in the bytes `body` of a file on this machine: uint8 RGB, upright (H, W, 3).
+    """Decode the bytes `body` of an image file on this machine; returns upright uint8 RGB (H, W,
+    3).
 
     Raises ImageError for an image that cannot be used.
     """
@@ -132,7 +133,8 @@ def decode_file(body: bytes) -> NDArray[np.uint8]:
 
 
 def check_file_size(width: int, height: int) -> None:
-    """Raise ImageError unless a file on this machine may have an image of this size (px)."""
+    """Raise ImageError unless an image of this size (px) may be read from a file on this machine:
+    at least 16 px a side and at most 256 million px."""
     if min(width, height) < MIN_SIDE_PX or width * height > MAX_FILE_PIXELS:
         raise ImageError(
             Fault.SIZE,
@@ -142,7 +144,7 @@ def check_file_size(width: int, height: int) -> None:
 
 
 def read_header(body: bytes) -> ImageHeader:
-    """The header of an image sent to the service, checked against the service's limits.
+    """Read the header of an image sent to the service, and check it against the service's limits.
 
     This takes at most a few ms; slower checks are left to `decode_whole`. Raises ImageError for an
     image that is not accepted.
@@ -222,7 +224,8 @@ def _check_late(body: bytes, header: ImageHeader) -> None:
 
 
 def check_trailing(count: int) -> None:
-    """Raise ImageError when more than `MAX_TRAILING_BYTES` follow the end of the image."""
+    """Raise ImageError when `count`, the number of bytes after the end of the image, is above
+    64."""
     if count > MAX_TRAILING_BYTES:
         raise ImageError(
             Fault.TRAILING,
@@ -232,7 +235,8 @@ def check_trailing(count: int) -> None:
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise ImageError unless an image of this size (px) is within the service's limits."""
+    """Raise ImageError unless an image of this size (px) is within the service's limits: 16 to 4096
+    px a side and at most 8.4 million px."""
     sides = min(width, height) >= MIN_SIDE_PX and max(width, height) <= MAX_SIDE_PX
     if not sides or width * height > MAX_PIXELS:
         raise ImageError(
@@ -243,8 +247,9 @@ def check_size(width: int, height: int) -> None:
 
 
 def decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
-    """The image as uint8 RGB (header.height, header.width, 3). Raises ImageError when it is damaged
-    or not accepted."""
+    """Decode the image `body`, whose header `read_header` has read; returns uint8 RGB
+    (header.height, header.width, 3). Raises ImageError when the image is damaged or not
+    accepted."""
     if header.png_header is not None:
         image = _decode_png(body, header.png_header)
     else:
@@ -264,10 +269,11 @@ def decode_whole(body: bytes, header: ImageHeader) -> NDArray[np.uint8]:
 def crop_and_resize(
     image: NDArray[np.uint8], view: CameraParameters, fov_y_deg: float | None = None
 ) -> NDArray[np.uint8]:
-    """An image (H, W, 3) cropped and scaled to (view.height, view.width, 3).
+    """Crop an image (H, W, 3) to the field of view of `view`, and scale it to (view.height,
+    view.width, 3).
 
-    `fov_y_deg`: vertical field of view of the image, degrees; None: that of `view`. Raises
-    ImageError when the image shows less than `view`.
+    `fov_y_deg`: vertical field of view of the image, degrees; None: the field of view of `view`.
+    Raises ImageError when the image shows less than `view`.
     """
     box = crop_box(image.shape[1], image.shape[0], view, fov_y_deg)
     if box is not None:

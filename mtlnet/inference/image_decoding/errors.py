@@ -1,4 +1,4 @@
-"""The error for an image that cannot be used. `serve` maps its kind to an HTTP status."""
+"""The error for an image that cannot be used. `serve` maps its reason to an HTTP status."""
 
 from enum import StrEnum
 
@@ -6,7 +6,7 @@ from trackfeatures.errors import UserError
 
 
 class Fault(StrEnum):
-    """The kinds of reasons why an image cannot be used."""
+    """The reasons why an image cannot be used."""
 
     NOT_AN_IMAGE = "not-an-image"
     DAMAGED = "damaged-image"
@@ -18,7 +18,7 @@ class Fault(StrEnum):
 
 
 class ImageError(UserError):
-    """Raised for an image that the model cannot use; `fault` is the kind of reason."""
+    """Raised for an image that the model cannot use; `fault` is the reason."""
 
     def __init__(self, fault: Fault, message: str) -> None:
         super().__init__(message)

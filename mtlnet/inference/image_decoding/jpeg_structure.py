@@ -34,7 +34,8 @@ END_OF_DATA = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # FF and a byte of `ENDS
 
 @dataclass(frozen=True, slots=True)
 class JpegStructure:
-    """Length of a JPEG including its end marker, bytes; number of scans; orientation, 1 to 8."""
+    """Structure of a JPEG: its `length` in bytes including the end marker, its number of `scans`,
+    and its `orientation`, as in EXIF, 1 to 8."""
 
     length: int
     scans: int
@@ -43,9 +44,10 @@ class JpegStructure:
 
 @dataclass(frozen=True, slots=True)
 class JpegHead:
-    """Content of a JPEG before its first scan: whether it is progressive, its orientation, 1 to 8.
+    """The content of a JPEG before its first scan. `orientation` is as in EXIF, 1 to 8.
 
-    `description`: a JPEG reduced to the segments before the first scan that state size and colours.
+    `description` is the JPEG reduced to the segments before the first scan that state size and
+    colours. A decoder can read the size and colours from it.
     """
 
     is_progressive: bool
@@ -54,8 +56,8 @@ class JpegHead:
 
 
 def read_head(body: bytes) -> JpegHead:
-    """The content of a JPEG before its first scan, read in at most 3 ms. Raises ImageError for a
-    damaged JPEG or too many segments."""
+    """Read the content of a JPEG before its first scan, in at most 3 ms. Raises ImageError for a
+    damaged JPEG or more than 1,000 segments."""
     at, frame, exif, kept = len(START), 0, None, [START]
     for _ in range(MAX_SEGMENTS):
         at, marker = _marker(body, at)
@@ -74,10 +76,10 @@ def read_head(body: bytes) -> JpegHead:
 
 
 def read_structure(body: bytes) -> JpegStructure:
-    """The structure of the JPEG at the start of `body`. Raises ImageError for a damaged JPEG, or
-    too many scans or segments.
+    """Read the structure of the JPEG at the start of `body`. Raises ImageError for a damaged JPEG,
+    and for more than 100 scans or 1,000 segments.
 
-    Takes at most 3 ms per MiB; other threads can run after each `WINDOW_BYTES`.
+    Takes at most 3 ms per MiB; other threads can run after each 256 KiB.
     """
     at, scans, exif = len(START), 0, None
     for _ in range(MAX_SEGMENTS):

@@ -24,19 +24,20 @@ OFFSETS = {42: ("I", 4), 43: ("Q", 8)}
 
 
 def swaps_sides(orientation: int) -> bool:
-    """Whether the upright image has the stored height as its width."""
+    """Return whether an image of this orientation (1 to 8) is turned by a quarter to be upright, so
+    that its stored height becomes its width."""
     return orientation >= 5
 
 
 def exif_orientation(exif: bytes) -> int:
-    """The orientation, 1 to 8, in an Exif block with or without its mark `Exif`; 1 (upright) if the
-    block has none."""
+    """Return the orientation, 1 to 8, in an Exif block with or without its mark `Exif`; 1 (upright)
+    if the block has none."""
     kind, value = read_tags(exif.removeprefix(EXIF_MARK)).get(ORIENTATION, (SHORT, NONE))
     return value if kind == SHORT and 1 <= value <= 8 else NONE
 
 
 def read_tags(block: bytes) -> dict[int, tuple[int, int]]:
-    """The first directory of a TIFF block, as a dict from tag to (type, value).
+    """Read the first directory of a TIFF block; returns a dict from tag to (type, value).
 
     The value is -1 if it is not a single SHORT or LONG. Of a damaged block, the dict has the tags
     that can be read.
@@ -65,7 +66,8 @@ def read_tags(block: bytes) -> dict[int, tuple[int, int]]:
 
 
 def upright(image: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """The image (H, W, C), rotated and mirrored to be upright; (W, H, C) where sides are swapped.
+    """Rotate and mirror an image (H, W, C) to be upright; returns (H, W, C), or (W, H, C) where the
+    sides are swapped.
 
     `orientation` names the sides of the upright image where the stored first row and first column
     are: 1 top left, 2 top right, 3 bottom right, 4 bottom left, 5 left top, 6 right top, 7 right

@@ -1,5 +1,5 @@
-"""Decodes image files of this machine other than JPEG and PNG, if OpenCV reads their kind; for
-other kinds the error message names the kind.
+"""Decodes image files of this machine other than JPEG and PNG, if OpenCV reads their kind. For a
+kind that is not read, the error message names the kind.
 
 The kind of a file is determined by its first bytes, not its name. Its size is read from its header
 before OpenCV decodes it, because OpenCV allocates memory for the stated size. If a file has several
@@ -41,8 +41,8 @@ Header = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of image file. `signature` matches the first bytes of a file; `suffix` is the name
-    suffix by which OpenCV identifies the kind."""
+    """A kind of image file. `signature` matches the first bytes of a file; `suffix` is the end of a
+    file's name by which OpenCV identifies the kind, such as ".webp"."""
 
     name: str
     suffix: str
@@ -52,12 +52,14 @@ class Kind:
 
 
 def find_kind(body: bytes) -> Kind | None:
-    """The kind of image file that `body` holds; None for a kind that OpenCV does not decode."""
+    """Return the kind of image file that `body` holds; None for JPEG, PNG and all kinds that are
+    not read."""
     return next((kind for kind in KINDS if kind.signature.match(body[:FIRST_BYTES])), None)
 
 
 def describe(body: bytes) -> str:
-    """Text of a message about bytes that are not a JPEG or PNG: what they are, and advice."""
+    """Return a text for an error message about bytes that are not a JPEG or PNG. It names their
+    kind and gives advice."""
     if (kind := find_kind(body)) is not None:
         return f"a {kind.name} image; {SAVE}"
     first = body[:FIRST_BYTES]
@@ -68,7 +70,8 @@ def describe(body: bytes) -> str:
 
 
 def read_header(body: bytes, kind: Kind) -> Header:
-    """The header of a file of this kind. Raises ImageError for a damaged or unsupported file."""
+    """Read the header of a file of this kind; returns width and height (px) and orientation, 1 to
+    8. Raises ImageError for a damaged or unsupported file."""
     try:
         return kind.read_header(body)
     except (struct.error, IndexError):
@@ -78,8 +81,8 @@ def read_header(body: bytes, kind: Kind) -> Header:
 
 
 def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
-    """The first picture of a file, upright, as uint8 RGB (H, W, 3). Raises ImageError when OpenCV
-    cannot decode it."""
+    """Decode the first picture of a file; returns upright uint8 RGB (H, W, 3). `orientation`: as
+    returned by `read_header`. Raises ImageError when OpenCV cannot decode the file."""
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(body, np.uint8), flags)

@@ -35,7 +35,7 @@ FILTERS = 5
 class PngHeader:
     """Header of a PNG (IHDR): size in px, bits per pixel, and whether it is interlaced.
 
-    `file_bytes`: size of the whole file, whose checksums are verified.
+    `file_bytes`: size of the whole file in bytes.
     """
 
     width: int
@@ -45,8 +45,8 @@ class PngHeader:
     file_bytes: int
 
     def passes(self) -> list[tuple[int, int]]:
-        """Number of rows, and bytes per row without the filter byte, of each interlacing pass; one
-        pass if the PNG is not interlaced."""
+        """Return, for each interlacing pass, the number of rows and the bytes per row without the
+        filter byte. A PNG that is not interlaced has one pass."""
         steps = PASSES if self.interlaced else ((0, 0, 1, 1),)
         sizes = []
         for column, row, across, down in steps:
@@ -58,8 +58,8 @@ class PngHeader:
 
 
 def read_header(body: bytes) -> PngHeader:
-    """The header of a PNG that starts with SIGNATURE. Raises ImageError for a header that PNG does
-    not define."""
+    """Read the header of a PNG that starts with `SIGNATURE`. Raises ImageError for a header that
+    the PNG specification does not allow."""
     start = len(SIGNATURE)
     if len(body) < start + 25 or body[start : start + 8] != b"\x00\x00\x00\x0dIHDR":
         raise ImageError(Fault.DAMAGED, "the PNG does not begin with IHDR; save it anew")
@@ -78,7 +78,8 @@ def read_header(body: bytes) -> PngHeader:
 
 
 def find_exif(body: bytes, *, limited: bool = True) -> bytes:
-    """Content of the first `eXIf` chunk; empty if there is none. Its checksum is not verified.
+    """Return the content of the first `eXIf` chunk; empty if there is none. Its checksum is not
+    verified.
 
     `limited`: search only as many chunks as `critical_chunks` allows.
     """
@@ -99,10 +100,11 @@ def _most_chunks(body: bytes, limited: bool) -> int:
 
 
 def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> tuple[bytes, int]:
-    """The PNG reduced to its checked critical chunks (header, palette, pixels, end), and the offset
-    of the PNG's end in `body`.
+    """Check a PNG; returns the PNG reduced to its critical chunks (header, palette, pixels, end),
+    and the offset of its end in `body`.
 
-    `limited`: refuse a PNG with too many chunks. Raises ImageError for a damaged or refused PNG.
+    `limited`: allow at most 256 chunks plus one for each KiB of the file. Raises ImageError for a
+    damaged or refused PNG.
     """
     kept: list[bytes | memoryview] = [SIGNATURE]
     pixels: list[memoryview] = []
