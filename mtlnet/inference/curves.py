@@ -21,8 +21,8 @@ HEADER = ",".join(COLUMNS) + "\n"
 
 
 def read_curves(path: Path) -> list[dict[str, float]]:
-    """The rows of a `curves.csv`, each a dict from column name to value; an empty list if the file
-    is missing or has other columns.
+    """Read a `curves.csv`; returns its rows, each a dict from column name to value. The list is
+    empty if the file is missing or has other columns.
 
     Damaged rows are skipped, because a full disk or a power failure can truncate the last row.
     """

@@ -48,7 +48,7 @@ class Engine(Protocol):
         """Precision of the computation: "f32", "bf16" or "int8"."""
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Outputs (K,) for an image (H, W, 3) RGB of the size of `card.camera`.
+        """Return the outputs (K,) for an RGB image (H, W, 3) of the size of `card.camera`.
 
         `mtlnet.inference.prediction.split_outputs` explains the K numbers, `decode_outputs`
         converts them to metres and radians. Raises ModelError for an image of another size or type.
@@ -63,12 +63,14 @@ def load_engine(
     *,
     gpu: bool = False,
 ) -> Engine:
-    """Load the model in folder `run` (see `mtlnet.inference.model_card.resolve_run`).
+    """Load the model in folder `run`, which `mtlnet.inference.model_card.resolve_run` finds by
+    name.
 
     `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate and
-    fits this processor (`uses_int8`), else bf16 if the processor supports it, else float32. The
-    torch engine supports only float32; with `gpu` it computes on a GPU if there is one. Raises
-    ModelError when the model is missing, unfinished or damaged.
+    is reliable on this processor (`uses_int8`), else bf16 if the processor supports it, else
+    float32. The torch engine supports only float32; with `gpu` it computes on a GPU if there is
+    one. `threads`: number of CPU threads for one image. Raises ModelError when the model is
+    missing, unfinished or damaged.
     """
     card = read_card(run)
     if kind == "torch":
@@ -84,7 +86,7 @@ def load_engine(
 
 
 class OpenVinoEngine:
-    """The exported graph, compiled for this CPU."""
+    """The model's OpenVINO graph, compiled for this CPU."""
 
     kind = "openvino"
 
@@ -131,7 +133,7 @@ def _read_model(graph: Path) -> Any:
 
 
 def read_graph(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run, read from its stored graph. A run written without OpenVINO or by
+    """Read the OpenVINO model of a run from its stored graph. A run written without OpenVINO or by
     an earlier `mtlnet ship` has no graph; then its weights are converted, which requires torch.
 
     Raises ModelError when a file is missing or damaged, RuntimeError when OpenVINO cannot read it.
@@ -153,10 +155,10 @@ def read_graph(run: Path, card: ModelCard) -> Any:
 def run_graph(
     graph: Any, precision: str, images: NDArray[np.uint8], batch: int = 1
 ) -> NDArray[np.float32]:
-    """Outputs (N, K) of an OpenVINO model for uint8 images (N, 210, 280, 3).
+    """Compute the outputs (N, K) of an OpenVINO model for uint8 images (N, 210, 280, 3).
 
-    `graph`: the model or the path of its file; `precision`: "f32" or "bf16"; `batch`: images per
-    inference. `mtlnet.inference.prediction.split_outputs` explains the K columns. Raises
+    `graph`: an `openvino.Model` or the path of its file; `precision`: "f32" or "bf16"; `batch`:
+    images per inference. `mtlnet.inference.prediction.split_outputs` explains the K columns. Raises
     RuntimeError when OpenVINO cannot load the model.
     """
     options = {"INFERENCE_PRECISION_HINT": precision, "NUM_STREAMS": 1}
@@ -170,8 +172,8 @@ def run_graph(
 
 
 def read_export(folder: Path) -> dict[str, Any] | None:
-    """Content of the `export.json` of a folder; None if the file does not exist. Raises ModelError
-    when it is damaged."""
+    """Read the `export.json` of a folder; None if the file does not exist. Raises ModelError when
+    it is damaged."""
     path = folder / EXPORT_FILE
     if not path.is_file():
         return None
@@ -185,11 +187,12 @@ def read_export(folder: Path) -> dict[str, Any] | None:
 
 
 def uses_int8(run: Path, card: ModelCard) -> bool:
-    """Whether int8 is the default precision of a run on this processor.
+    """Return whether int8 is the default precision of a run on this processor.
 
     True if the run has an int8 graph of the card's weights that passed its accuracy gate
-    (`mtlnet.export.int8`), and the processor multiplies int8 natively. Other processors can round
-    sums differently, so there it is true only if the gate was judged without native int8, too.
+    (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor that does not
+    can round sums differently; on such a processor it is true only if the gate was judged without
+    native int8, too.
     """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:
@@ -199,8 +202,8 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
 
 
 def int8_graph(run: Path, card: ModelCard) -> Path:
-    """Path of a run's int8 graph. Raises ModelError if it is missing, damaged, or made from other
-    weights than the card's."""
+    """Return the path of a run's int8 graph. Raises ModelError if a file of the graph is missing or
+    damaged, or if the graph was made from other weights than the card's."""
     folder = run / INT8
     about = read_export(folder)
     how = f"make it with `mtlnet export --model {run} --format openvino --precision int8`"
@@ -216,28 +219,29 @@ def int8_graph(run: Path, card: ModelCard) -> Path:
 
 
 def parse_kind(text: str) -> EngineKind:
-    """The kind of engine called `text`. Raises ModelError for an unknown name."""
+    """Return the kind of engine called `text`, "openvino" or "torch". Raises ModelError for another
+    name."""
     if text not in get_args(EngineKind):
         raise ModelError(f"there is no engine {text!r}; choose openvino or torch")
     return cast(EngineKind, text)
 
 
 def parse_precision(text: str | None) -> Precision | None:
-    """The precision called `text`; None stands for the default. Raises ModelError for an unknown
-    name."""
+    """Return the precision called `text`, "int8", "bf16" or "f32"; None, which stands for the
+    default, is returned unchanged. Raises ModelError for another name."""
     if text not in (None, *get_args(Precision)):
         raise ModelError(f"there is no precision {text!r}; choose int8, bf16 or f32")
     return cast(Precision | None, text)
 
 
 def has_openvino() -> bool:
-    """Whether OpenVINO is installed. Without it, models are trained and evaluated by torch
+    """Return whether OpenVINO is installed. Without it, models are trained and evaluated by torch
     alone."""
     return find_spec("openvino") is not None
 
 
 def openvino_core() -> Any:
-    """The only `openvino.Core` of this process.
+    """Return the only `openvino.Core` of this process; the first call makes it.
 
     OpenVINO's CPU plugin gives the thread that loads it an alternate signal stack (`sigaltstack`).
     It unmaps that stack when the last user of the plugin is dropped, in any thread; a later signal
@@ -260,6 +264,6 @@ _core_lock = Lock()
 
 
 def best_precision() -> Precision:
-    """bf16 if this CPU supports it natively (AVX512-BF16 or AMX), else float32."""
+    """Return "bf16" if this CPU supports it natively (AVX512-BF16 or AMX), else "f32"."""
     capabilities = openvino_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     return "bf16" if "BF16" in capabilities else "f32"

@@ -7,7 +7,7 @@ SKY, GRASS, ASPHALT, PAINT = (150, 180, 220), (70, 110, 60), (95, 95, 100), (230
 
 
 def golden_image(width: int, height: int) -> NDArray[np.uint8]:
-    """A straight one-lane road under a clear sky, uint8 RGB (height, width, 3).
+    """Draw a straight one-lane road under a clear sky, uint8 RGB (height, width, 3).
 
     The card of a model states the model's outputs for this image; the service compares its own
     outputs with them at start. The image is computed in integers, so that it is the same on every

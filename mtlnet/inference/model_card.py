@@ -92,17 +92,18 @@ class ModelCard:
             )
 
     def write(self, run: Path) -> None:
-        """Write `card.json` into the folder `run`, atomically."""
+        """Write `card.json` to the folder `run`, atomically."""
         content = {"format": FORMAT, "model_hash": self.model_hash}
         content |= asdict(self, dict_factory=stored)
         write_json(run / CARD, content)
 
 
 def read_card(run: Path) -> ModelCard:
-    """The card of the run in folder `run`.
+    """Read the card of the run in folder `run`.
 
-    Raises ModelError when the card is missing, unreadable or of another format, DefinitionsMismatch
-    for a model of another version of the track-feature definitions.
+    Raises ModelError when the card is missing, damaged or of an unknown format, or when a shipped
+    model does not have the weights of this version of the program; DefinitionsMismatch for a model
+    of another version of the track-feature definitions.
     """
     path = run / CARD
     if not run.is_dir():
@@ -141,7 +142,8 @@ def read_card(run: Path) -> ModelCard:
 
 
 def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
-    """Raise ModelError unless the named files of `run` have the hashes of the card."""
+    """Raise ModelError unless each file in `names` exists in the folder `run` and has the hash that
+    the card states."""
     for name in names:
         path = run / name
         if not path.is_file():
@@ -155,7 +157,8 @@ def check_files(run: Path, card: ModelCard, names: tuple[str, ...]) -> None:
 
 
 def resolve_run(name: str | Path, runs: Path = RUNS) -> Path:
-    """The folder of a run given as a path, a name in `runs/`, "latest", or a shipped model's name.
+    """Return the folder of a run. `name`: a path, a name in the folder `runs`, "latest", or the
+    name of a shipped model.
 
     The shipped models are "default" and "varied" (for real roads). "default" stands for the latest
     run if no model is shipped. A folder or a run called "varied" has precedence over the shipped

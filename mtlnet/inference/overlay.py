@@ -32,10 +32,11 @@ TOP_VIEW_WIDTH, TOP_VIEW_METRES = 160, 16.0
 def marking_line(
     distance: float, angle: float, curvature: float, at: ArrayLike | None = None
 ) -> NDArray[np.float64]:
-    """Points (N, 2), m in the car frame, of a marking `distance` m to the right of the car.
+    """Return points (N, 2), m in the car frame, of a marking `distance` m to the right of the car
+    (negative: to the left).
 
     `angle`: angle of the car to the track, rad; `curvature` of the track: 1/m, positive to the
-    left; `at` (N,): positions along the track, m; None: 24 points `NEAR_M` to `FAR_M` ahead.
+    left; `at` (N,): positions along the track, m ahead of the car; None: 24 points 3 to 14 m ahead.
     """
     along = np.linspace(NEAR_M, FAR_M, 24) if at is None else np.asarray(at, np.float64)
     left = curvature * along**2 / 2 - distance
@@ -44,8 +45,8 @@ def marking_line(
 
 
 def to_pixels(points: NDArray[np.float64], camera: CameraParameters) -> NDArray[np.int32]:
-    """Pixels (M, 2), in an image enlarged by `SCALE`, of the M road points that the camera sees of
-    `points` (N, 2), m in the car frame."""
+    """Return the pixels (M, 2), in an image enlarged twice, of the road points in `points` (N, 2),
+    m in the car frame, that the camera sees. M is their number."""
     road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -60,10 +61,12 @@ def draw_overlay(
     truth: tuple[Distances, float],
     prediction: tuple[Distances, float],
 ) -> Image:
-    """The enlarged frame (H, W, 3) RGB beside a view from above: truth green, prediction orange.
+    """Draw markings on a frame (H, W, 3) RGB, enlarged twice, and on a view from above to its
+    right; returns the picture (2 H, 2 W + 160, 3). True markings are green, predicted markings
+    orange.
 
-    `truth` and `prediction`: distances (m) and angle (rad). Both are drawn with the road's true
-    curvature, which is not predicted.
+    `truth` and `prediction`: distances (m) by marking, and angle (rad). Both are drawn with the
+    road's true `curvature` (1/m, positive to the left), which is not predicted.
     """
     size = (frame.shape[1] * SCALE, frame.shape[0] * SCALE)
     canvas = cv2.resize(frame, size, interpolation=cv2.INTER_CUBIC)
@@ -83,7 +86,8 @@ def draw_overlay(
 
 
 def draw_markings(image: Image, camera: CameraParameters, prediction: Prediction) -> Image:
-    """A copy of an image (H, W, 3) RGB of `camera` with the markings drawn, at the image's size.
+    """Return a copy of an image (H, W, 3) RGB, taken by `camera`, with the predicted markings
+    drawn.
 
     The markings are drawn straight, because the curvature is not predicted.
     """
@@ -103,8 +107,8 @@ def draw_road_line(
     colour: tuple[int, int, int],
     thickness: int,
 ) -> None:
-    """Draw a line through `points` (N, 2) of the road, m in the car frame, where the camera sees
-    them. Changes `canvas` in place; `thickness` in px."""
+    """Draw a line through `points` (N, 2) on the road, m in the car frame, on the image `canvas` in
+    place. Points that the camera does not see are left out. `colour`: RGB; `thickness` in px."""
     road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(1) & (np.abs(pixels) < MAX_PX).all(1)]

@@ -99,7 +99,7 @@ class Prediction:
         return max(self.heading, key=self.heading.__getitem__)
 
     def as_json(self) -> dict[str, Any]:
-        """The prediction as JSON, in the form of the service's answer."""
+        """Return the prediction as values for JSON, with the keys of the service's answer."""
         return {
             "distances_m": dict(self.distances_m),
             "to_lane_centre_m": self.to_lane_centre_m,
@@ -112,7 +112,8 @@ class Prediction:
 
 
 def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
-    """Decode the outputs (K,) of one image; `split_outputs` explains the K numbers.
+    """Decode the outputs (K,) of one image to track features; `split_outputs` explains the K
+    numbers.
 
     Raises ValueError for another shape.
     """

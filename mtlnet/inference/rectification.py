@@ -45,8 +45,9 @@ Metres = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rectification:
-    """Converts images of one camera to images of another camera, at the same or another position on
-    the car.
+    """Converts images of the camera `source` to the view of the camera `target`, and labels and
+    outputs between metres at the two cameras. They can be mounted at different positions on the
+    car.
 
     `source` took the images, at any size of its aspect ratio; `target`, without distortion, is the
     model's camera.
@@ -65,14 +66,16 @@ class Rectification:
 
     @property
     def view(self) -> CameraParameters:
-        """The camera that takes the rectified images from the position of the source."""
+        """The camera `target`, moved to the position of `source`. It would take the rectified
+        images."""
         source = self.source
         return replace(self.target, x=source.x, y=source.y, z=source.z)
 
     def image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image (H, W, 3) of the source as uint8 (target.height, target.width, 3).
+        """Rectify an image (H, W, 3) of the source; returns uint8 (target.height, target.width, 3).
 
-        Raises ImageError when it has another aspect ratio or shows too little of the target's view.
+        Raises ImageError when the image has another aspect ratio than the source or shows too
+        little of the target's view.
         """
         height, width = image.shape[:2]
         source, target = self.source, self.target
@@ -106,7 +109,8 @@ class Rectification:
 
     def check(self, width: int, height: int) -> None:
         """Raise ImageError unless images of this size, px, have the source's aspect ratio and show
-        enough of the target's view."""
+        at least a quarter of the target's rows and columns, and a tenth of its rows below the
+        horizon."""
         source = self.source
         stretch = width * source.height / (height * source.width)
         if abs(stretch - 1) > TOLERANCE:
@@ -130,13 +134,14 @@ class Rectification:
                 )
 
     def outputs(self, outputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A model's outputs (N, K) for rectified images, converted to the car that carries the
-        source camera.
+        """Convert a model's outputs (N, K) for rectified images to metres of the car with the
+        source camera; returns the converted outputs (N, K).
 
-        Distances and their standard deviations change; the latter then include the standard
-        deviation of the source's height. Absent distances stay absent. The angle does not change,
-        because the rectified view looks along the car. All images of a camera that is too high or
-        too low (`SEEN_LANES_M`) are out of distribution. `split_outputs` explains the K columns.
+        Distances and their standard deviations change; the standard deviations then include the
+        uncertainty of the source's height. Absent distances stay absent. The angle does not change,
+        because the rectified view looks along the car. If the camera is too high or too low
+        (`SEEN_LANES_M`), all images are marked as out of distribution. `split_outputs` explains the
+        K columns.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)
@@ -159,7 +164,8 @@ class Rectification:
         return changed
 
     def labels(self, distances: NDArray[np.float32], angle: NDArray[np.float32]) -> Metres:
-        """Targets of the distances for rectified images: (N, 5), m, NaN where absent.
+        """Return the targets of the distances for rectified images: (N, 5), m at the target camera,
+        NaN where absent.
 
         `distances` (N, 5) m and `angle` (N,) rad are the labels of cars with the source camera.
         `outputs` is the inverse conversion.
@@ -204,8 +210,8 @@ def _fixed_maps(
 
 @lru_cache(maxsize=KEPT_MAPS)
 def shown_shares(source: CameraParameters, target: CameraParameters) -> tuple[float, float, float]:
-    """Share of the target's rows of which the source shows a part; the same share of its columns,
-    and of its rows below the horizon of a level road."""
+    """Return three shares of the target's view: of its rows, of its columns, and of its rows below
+    the horizon of a level road. A row or column counts if the source shows any part of it."""
     u, v = _maps(source, target)
     inside = (u >= -0.5) & (u <= source.width - 0.5) & (v >= -0.5) & (v <= source.height - 0.5)
     rows, columns = inside.any(1), inside.any(0)

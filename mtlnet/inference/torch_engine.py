@@ -31,7 +31,8 @@ class TorchEngine:
     precision = "f32"
 
     def __init__(self, run: Path, card: ModelCard, threads: int = 1, *, gpu: bool = False) -> None:
-        """`gpu`: compute on a GPU if there is one."""
+        """Load the model in the folder `run`. `threads`: number of CPU threads of torch; `gpu`:
+        compute on a GPU if there is one."""
         torch.set_num_threads(threads)
         self.card = card
         self.on_gpu = gpu and torch.cuda.is_available()
@@ -46,7 +47,7 @@ class TorchEngine:
         return result
 
     def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Outputs (B, K) for uint8 images (B, H, W, 3);
+        """Compute the outputs (B, K) for uint8 images (B, H, W, 3);
         `mtlnet.inference.prediction.split_outputs` explains the K columns."""
         device = next(self.served.parameters()).device
         with torch.inference_mode():
@@ -58,8 +59,8 @@ class TorchEngine:
 
 
 def load_served(run: Path, card: ModelCard) -> ServedNetwork:
-    """The network of a run with its uncertainty head, if the model has one. Raises ModelError when
-    a file is missing or damaged."""
+    """Load the network of a run, with its uncertainty head if the model has one. Raises ModelError
+    when a file is missing or damaged."""
     has_head = card.uncertainty is not None
     check_files(run, card, (WEIGHTS, UNCERTAINTY_WEIGHTS) if has_head else (WEIGHTS,))
     head = read_uncertainty_head(run) if has_head else None
@@ -67,8 +68,8 @@ def load_served(run: Path, card: ModelCard) -> ServedNetwork:
 
 
 def convert_run(run: Path, card: ModelCard) -> Any:
-    """The OpenVINO model of a run, converted from its weights. Raises ModelError when a file is
-    missing or damaged."""
+    """Convert the weights of a run to an `openvino.Model` and return it. Raises ModelError when a
+    file is missing or damaged."""
     served = load_served(run, card)
     return build_graph(served.network, served.head)
 

@@ -1,5 +1,5 @@
-"""The entries of a model's card about the rounds of its training: seeds as ranges, names as a
-digest.
+"""Reads and writes the entries of a model's card about the rounds of its training. Seeds are stored
+as ranges, names as a digest.
 
 A card of format 5, and a `config.json` written at the time of that format, list every seed and
 every name; `shortened` accepts both forms.
@@ -23,13 +23,13 @@ class Seeds:
 
     @staticmethod
     def of(seeds: Iterable[int]) -> "Seeds":
-        """The set of these seeds."""
+        """Return the set of the given seeds."""
         return _merged(range(seed, seed + 1) for seed in seeds)
 
     @staticmethod
     def read(entry: Mapping[str, Any] | Iterable[int]) -> "Seeds":
-        """The seeds in `entry`: the result of `Seeds.entry`, or a list of seeds (format 5). Raises
-        ValueError for a damaged entry."""
+        """Read the set of seeds from `entry`, a result of `Seeds.entry` or a list of seeds (format
+        5). Raises ValueError for a damaged entry."""
         if not isinstance(entry, Mapping):
             return Seeds.of(entry)
         seeds = _merged(_range(text) for text in entry["ranges"].split())
@@ -38,7 +38,8 @@ class Seeds:
         return seeds
 
     def entry(self) -> dict[str, Any]:
-        """The entry for a card: {"count": 4, "ranges": "1..3 7"}; both ends belong to a range."""
+        """Return the entry for a card, such as {"count": 4, "ranges": "1..3 7"}. Both ends belong
+        to a range."""
         texts = [
             f"{part.start}..{part[-1]}" if part[1:] else str(part.start) for part in self.ranges
         ]
@@ -77,16 +78,17 @@ def _merged(parts: Iterable[range]) -> Seeds:
 
 
 def names_entry(names: Iterable[str]) -> dict[str, Any]:
-    """The entry of a card for names of rounds: their number, and the SHA-256 of the sorted names as
-    JSON. Anyone who has a list of names can check whether it is the same set of rounds."""
+    """Return the entry of a card for names of rounds: their number, and the SHA-256 of the sorted
+    names as JSON. With a list of names anyone can check whether they are the same rounds."""
     ordered = sorted(names)
     digest = hashlib.sha256(json.dumps(ordered).encode()).hexdigest()
     return {"count": len(ordered), "sha256": digest}
 
 
 def shortened(about: Mapping[str, Any]) -> dict[str, Any]:
-    """A card's description of training data, or of the fit of the uncertainty head, with lists of
-    rounds replaced by short entries. Raises ValueError, KeyError or TypeError if it is damaged."""
+    """Return `about`, a card's description of training data or of the fit of the uncertainty head,
+    with lists of rounds replaced by short entries. Raises ValueError, KeyError or TypeError if it
+    is damaged."""
     short = dict(about)
     if "seeds" in about:
         short["seeds"] = Seeds.read(about["seeds"]).entry()
