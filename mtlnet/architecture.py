@@ -103,7 +103,8 @@ class Architecture:
     @property
     def uncertainty_inputs(self) -> int:
         """Number of inputs of the uncertainty head: the units of the last shared layer and, for a
-        network with bins, the spreads of the distributions of the five distances and the angle."""
+        network with bins, the spread of each of its six distributions (five distances and the
+        angle)."""
         return self.shared[-1] + (6 if self.bins else 0)
 
     @property
