@@ -128,8 +128,8 @@ def _cluster(slope: FloatArray, std: FloatArray, size: FloatArray) -> FloatArray
 
 
 def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit | None:
-    """Refine (x0, y0, b, slopes) by the Gauss-Newton method; each segment is assigned to the
-    marking that it lies on. None if the result is too uncertain."""
+    """Refine (x0, y0, b, slopes) by the Gauss-Newton method. Each segment is assigned to the
+    marking that it lies on. Returns None if the result is too uncertain."""
     state: FloatArray = np.array([x0, y0, 0.0, *slopes])
     covariance: FloatArray = np.zeros((0, 0))
     for step in range(ROUNDS):

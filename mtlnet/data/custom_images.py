@@ -177,7 +177,7 @@ def _read_pictures(
     copies: Sequence[str],
     skip_refused: bool,
 ) -> Iterator[tuple[str, list[NDArray[np.uint8] | ImageError]]]:
-    """Yields, for each picture, the SHA-256 of its file and its copies as seen by `camera`; an
+    """Yield, for each picture, the SHA-256 of its file and its copies as seen by `camera`. An
     ImageError stands for a copy that shows too little of the view of `camera`."""
 
     def read(row: int) -> tuple[str, list[NDArray[np.uint8] | ImageError]]:
@@ -253,7 +253,7 @@ def _prepared(
     target: CameraParameters,
     copy: str,
 ) -> NDArray[np.uint8] | ImageError:
-    """One copy of a picture as seen by the model's camera `target`.
+    """Return one copy of a picture as seen by the model's camera `target`.
 
     Returns an ImageError for a copy that shows too little of that camera's view; raises all other
     errors.
@@ -272,7 +272,7 @@ def _prepared(
 
 
 def _uncropped(path: Path, image: NDArray[np.uint8], camera: CameraParameters) -> NDArray[np.uint8]:
-    """An image with the camera's aspect ratio, scaled to its size.
+    """Scale an image, which must have the camera's aspect ratio, to the camera's size.
 
     It is not cropped, unlike images for prediction, because its labels belong to the whole image.
     """

@@ -181,7 +181,8 @@ def _check_head(path: Path, names: list[str]) -> None:
 
 
 def _parse(line: int, cells: Cells) -> tuple[LabelledPicture, list[float], float, int]:
-    """Picture, distances in m (NaN where absent), angle in rad and class of a row.
+    """Convert the cells of a row to its picture, distances in m (NaN where absent), angle in rad
+    and class.
 
     Raises ValueError with the reason for a faulty row.
     """
@@ -222,7 +223,7 @@ def _check_pairs(found: dict[str, float]) -> None:
 
 
 def _picture(line: int, cells: Cells) -> LabelledPicture:
-    """The picture with the optional cells of its row. Raises ValueError for a faulty cell."""
+    """Return the picture of a row, with its optional cells. Raises ValueError for a faulty cell."""
     camera = cells.get("camera", "")
     if camera and not path_within(camera):
         raise ValueError(f"the camera {camera!r} is no path within the folder")

@@ -74,7 +74,8 @@ def _as_mounted(camera: CameraParameters, other: CameraParameters) -> bool:
 
 
 def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArray[np.float32]:
-    """Distances (N, 5) of a round's frames in m at the model's `camera`, NaN where absent."""
+    """Return the distances (N, 5) of a round's frames, m at the model's `camera`, NaN where
+    absent."""
     rectification = round_rectification(info, camera)
     scale = 1 / rectification.scale
     # Distances are measured at the centre of gravity, not at the camera.
@@ -86,8 +87,8 @@ def _beside(labels: Labels, info: RoundInfo, camera: CameraParameters) -> NDArra
 
 
 def _foot(labels: Labels, info: RoundInfo) -> NDArray[np.float64]:
-    """Offsets (N,), m to the left, from the recorded position to the point at which the distances
-    were measured. On a banked road this point is the foot of the centre of gravity."""
+    """Return the offsets (N,), m to the left, from the recorded position to the point at which the
+    distances were measured. On a banked road this point is the foot of the centre of gravity."""
     level = labels.to_middle.astype(np.float64)
     expected = _measured(level, info.lanes, info.lane_width_m, info.line_offsets)
     gaps = labels.distances - expected
@@ -100,8 +101,8 @@ def _foot(labels: Labels, info: RoundInfo) -> NDArray[np.float64]:
 def _measured(
     to_middle: NDArray[np.float64], lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> NDArray[np.float32]:
-    """Distances (N, 5), m, NaN where absent, of cars at offsets `to_middle` (N,), m to the left,
-    from the middle of a road."""
+    """Return the distances (N, 5), m, NaN where absent, of cars at offsets `to_middle` (N,), m to
+    the left, from the middle of a road."""
     found = (tf.measure(y, 0.0, 0.0, 0.0, lanes, lane_width_m, offsets) for y in to_middle.tolist())
     rows = [[np.nan if d is None else d for d in each.distances.values()] for each in found]
     return np.array(rows, np.float32).reshape(-1, len(tf.MARKINGS))

@@ -72,7 +72,7 @@ def copied_picture(
 
 
 def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) -> NDArray[np.uint8]:
-    """The picture after rotating the camera to its right by `right` (rad) about its vertical
+    """Return the picture after rotating the camera to its right by `right` (rad) about its vertical
     axis."""
     cosine, sine = np.cos(right), np.sin(right)
     turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # new to old directions

@@ -88,7 +88,8 @@ class RoadAhead:
         return crossings(changed_points(points, params, self._camera), self._camera.width)
 
     def _read(self, indices: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Polylines (B, 2, POINTS, 2) in px of both markings, NaN where there is none."""
+        """Read the polylines (B, 2, 34, 2), px, of both markings of the lane, NaN where there is
+        none."""
         points = np.full((len(indices), SIDES, POINTS, 2), np.nan, np.float32)
         for row, i in enumerate(indices.tolist()):
             number, frame = self._places[i].tolist()
@@ -119,8 +120,8 @@ class RoadAhead:
 
 
 def _annotations(path: Path) -> Messages:
-    """The annotations of a round's frames, in their order. Raises DatasetError unless each image
-    has its annotation."""
+    """Read the annotations of a round's frames, in the order of the frames. Raises DatasetError
+    unless each image has its annotation."""
     found = open_round(path, (CAMERA, ANNOTATIONS)).messages
     if not np.array_equal(found[CAMERA].log_time, found[ANNOTATIONS].log_time):
         raise DatasetError(
@@ -189,7 +190,7 @@ def changed_points(
 
 @lru_cache(maxsize=2)
 def _turned(camera: CameraParameters) -> NDArray[np.float64]:
-    """Homographies (ROTATIONS, 3, 3) of all rotations of the augmentation."""
+    """Return the homographies (64, 3, 3) of all rotations of the augmentation."""
     return np.stack([rotation_homography(camera, *turn) for turn in rotations().tolist()])
 
 

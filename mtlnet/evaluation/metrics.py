@@ -301,7 +301,7 @@ def _baseline_errors(mean: dict[str, Any], labels: LabelArrays) -> NDArray[np.fl
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """Mean of the values that are not NaN; None when there are none."""
+    """Return the mean of the values that are not NaN; None when there are none."""
     present = values[~np.isnan(values)]
     return float(present.mean()) if len(present) else None
 

@@ -127,7 +127,7 @@ class OpenVinoEngine:
 
 
 def _read_model(graph: Path) -> Any:
-    """The OpenVINO model in a file. Raises RuntimeError when OpenVINO cannot read it."""
+    """Read the OpenVINO model in a file. Raises RuntimeError when OpenVINO cannot read it."""
     with utf8_path(graph) as plain:
         return openvino_core().read_model(str(plain))
 

@@ -180,16 +180,16 @@ _WIDTH = np.array([tf.RANGES[name].hi for name in tf.MARKINGS]) - _LOW
 
 
 def _aside(camera: CameraParameters, angle: NDArray[np.floating]) -> Metres:
-    """Offset (N, 1), m, of a camera to the left of the centre of gravity, across the road, for cars
-    that point `angle` (N,) rad to the right of the road."""
+    """Return the offset (N, 1), m, of a camera to the left of the centre of gravity, across the
+    road, for cars that point `angle` (N,) rad to the right of the road."""
     left: Metres = camera.y * np.cos(angle) - camera.x * np.sin(angle)
     return left[:, None]
 
 
 @lru_cache(maxsize=KEPT_MAPS)
 def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.float32]:
-    """Column and row (2, H, W), px, of the source's pixel for each pixel of the target; `OUTSIDE`
-    where the source shows nothing."""
+    """Return column and row (2, H, W), px, of the source's pixel for each pixel of the target;
+    `OUTSIDE` where the source shows nothing."""
     columns, rows = np.meshgrid(np.arange(target.width), np.arange(target.height))
     rays = target.rays(np.column_stack([columns.ravel(), rows.ravel()]))
     places = rays @ target.rotation() + (source.x, source.y, source.z)
@@ -201,8 +201,8 @@ def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.floa
 def _fixed_maps(
     source: CameraParameters, target: CameraParameters
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """The source's pixel for each pixel of the target, as the fixed-point maps (H, W, 2) and (H, W)
-    of cv2.remap."""
+    """Return the source's pixel for each pixel of the target, as the fixed-point maps (H, W, 2) and
+    (H, W) of cv2.remap."""
     u, v = _maps(source, target)
     coarse, fine = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)

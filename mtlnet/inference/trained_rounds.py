@@ -67,7 +67,7 @@ def _range(text: str) -> range:
 
 
 def _merged(parts: Iterable[range]) -> Seeds:
-    """The set of all seeds in `parts`, which may overlap."""
+    """Return the set of all seeds in `parts`, which may overlap."""
     merged: list[range] = []
     for part in sorted(parts, key=lambda part: part.start):
         if merged and part.start <= merged[-1].stop:

@@ -76,7 +76,8 @@ class DeviceAugment:
         return to_device(values, self._device)
 
     def _moved(self, x: Tensor, params: AugmentParams) -> Tensor:
-        """Shifted, rotated and mirrored images; each pixel is resampled once."""
+        """Return images `x` (B, 3, h, W) shifted, rotated and mirrored. Each pixel is resampled
+        once."""
         _, _, height, width = x.shape
         rows = torch.arange(height, device=x.device, dtype=torch.float32) + self._first_row
         columns = torch.arange(width, device=x.device, dtype=torch.float32)

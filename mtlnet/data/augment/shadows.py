@@ -93,7 +93,8 @@ def _draw(rng: np.random.Generator) -> Drawn:
 
 @lru_cache(maxsize=SHADOWS)
 def _state_before(number: int) -> Any:
-    """State of the generator before shadow `number`; one generator is used for all shadows."""
+    """Return the state of the generator before shadow `number`; one generator is used for all
+    shadows."""
     rng = np.random.default_rng(0)
     if number > 1:
         rng.bit_generator.state = _state_before(number - 1)
@@ -102,7 +103,7 @@ def _state_before(number: int) -> Any:
 
 
 def _field(drawn: Drawn) -> NDArray[np.float32]:
-    """Shadow density (FIELD, FIELD) in [0, 1], periodic in both directions."""
+    """Return the shadow density (1024, 1024), 0 to 1, which is periodic in both directions."""
     total = np.zeros_like(drawn.noise)
     wide = np.pad(drawn.noise, 64, mode="wrap")
     for deviation, weight in ((CROWN_CELLS, 1.0), (LEAF_CELLS, drawn.leaves)):

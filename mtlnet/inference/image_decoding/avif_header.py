@@ -37,7 +37,7 @@ def _primary(body: memoryview) -> tuple[int, int, int]:
 
 
 def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yields type and content of each box in `data`."""
+    """Yield type and content of each box in `data`."""
     at = 0
     for _ in range(MAX_BOXES):
         if at + 8 > len(data):
@@ -53,7 +53,8 @@ def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _associations(ipma: memoryview, item: int) -> list[int]:
-    """Numbers, from 1, of the properties of an item in an `ipma` box; 0 stands for no property."""
+    """Return the numbers, from 1, of the properties of an item in an `ipma` box; 0 stands for no
+    property."""
     id_bytes, step = 4 if ipma[0] else 2, 2 if ipma[3] & 1 else 1
     at = 8
     for _ in range(min(_number(ipma, 4, 4), MAX_BOXES)):

@@ -165,7 +165,7 @@ def read_header(body: bytes) -> ImageHeader:
 
 
 def _upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
-    """Width and height of the upright image."""
+    """Return width and height (px) of the upright image."""
     return (height, width) if swaps_sides(orientation) else (width, height)
 
 
@@ -188,7 +188,8 @@ def _inspect_jpeg(body: bytes) -> ImageHeader:
 
 
 def _jpeg_size(body: bytes) -> tuple[int, int, str]:
-    """Stored width and height, px, and colour space. Raises ImageError for a damaged header."""
+    """Return the stored width and height, px, and the colour space. Raises ImageError for a damaged
+    header."""
     try:
         # The decoder's own header reader, so that sizes cannot differ from the decoded image.
         height, width, colours, _ = simplejpeg.decode_jpeg_header(body)
@@ -198,8 +199,8 @@ def _jpeg_size(body: bytes) -> tuple[int, int, str]:
 
 
 def _check_jpeg(body: bytes, width: int, height: int) -> jpeg.JpegStructure:
-    """The structure of a JPEG of `width` x `height` px. Raises ImageError for a damaged JPEG, bytes
-    after the image, or too many scans."""
+    """Return the structure of a JPEG of `width` x `height` px. Raises ImageError for a damaged
+    JPEG, bytes after the image, or too many scans."""
     structure = jpeg.read_structure(body)
     check_trailing(len(body) - structure.length)
     if structure.scans * width * height > MAX_SCANNED_PX:
@@ -294,8 +295,8 @@ def _decode_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
-    """Pixels of a JPEG (H, W, 3). A JPEG that cannot be decoded is tried again without zeros before
-    its end marker, which drivers of some webcams write."""
+    """Decode a JPEG to pixels (H, W, 3). A JPEG that cannot be decoded is tried again without zeros
+    before its end marker, which drivers of some webcams write."""
     try:
         return _decode_jpeg(body)
     except ImageError:
@@ -306,8 +307,8 @@ def _decode_padded_jpeg(body: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_png(body: bytes, header: png.PngHeader, *, limited: bool = True) -> NDArray[np.uint8]:
-    """Pixels (H, W, 3) of a PNG. `limited`: refuse too many chunks, and bytes after the image.
-    Raises ImageError when the PNG is damaged or refused."""
+    """Decode a PNG to pixels (H, W, 3). `limited`: refuse too many chunks, and bytes after the
+    image. Raises ImageError when the PNG is damaged or refused."""
     checked, end = png.critical_chunks(body, header, limited=limited)
     if limited:
         check_trailing(len(body) - end)

@@ -102,7 +102,7 @@ def read_structure(body: bytes) -> JpegStructure:
 
 
 def _marker(body: bytes, at: int) -> tuple[int, int]:
-    """Offset after the marker at offset `at`, and the marker's code."""
+    """Return the offset after the marker at offset `at`, and the marker's code."""
     if at + 2 > len(body):
         raise _ends_early(body)
     if body[at] != 0xFF:
@@ -119,7 +119,7 @@ def _marker(body: bytes, at: int) -> tuple[int, int]:
 
 
 def _find_marker(body: bytes, at: int) -> int:
-    """Offset of the marker after the entropy-coded data at offset `at`."""
+    """Return the offset of the marker after the entropy-coded data at offset `at`."""
     first = END_OF_DATA.search(body, at, at + FIRST_BYTES)
     if first is not None:
         return first.start()
@@ -143,7 +143,8 @@ def _length(body: bytes, at: int) -> int:
 
 
 def _exif(body: bytes, at: int, length: int) -> bytes | None:
-    """The Exif block in an APP1 segment whose length is at offset `at`; None for other content."""
+    """Return the Exif block in an APP1 segment whose length is at offset `at`; None for other
+    content."""
     is_exif = body.startswith(EXIF_MARK[:-1], at + 2)  # the last byte of the mark is padding
     return body[at + 2 + len(EXIF_MARK) : at + length] if is_exif else None
 

@@ -101,8 +101,8 @@ def decode(body: bytes, kind: Kind, orientation: int) -> NDArray[np.uint8]:
 
 
 def _read_webp(body: bytes) -> Header:
-    """The header of a WebP file (RFC 9649), whose first chunk is a lossy or lossless picture, or
-    describes the following chunks."""
+    """Read the header of a WebP file (RFC 9649), whose first chunk is a lossy or lossless picture,
+    or describes the following chunks."""
     kind, data = body[12:16], body[20:30]
     if kind == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 6)
@@ -115,7 +115,8 @@ def _read_webp(body: bytes) -> Header:
 
 
 def _riff_chunk(body: bytes, wanted: bytes) -> bytes:
-    """Content of the first chunk of type `wanted` in a RIFF file; empty if there is none."""
+    """Return the content of the first chunk of type `wanted` in a RIFF file; empty if there is
+    none."""
     at = 12
     while at + 8 <= len(body):
         size = int.from_bytes(body[at + 4 : at + 8], "little")
@@ -133,8 +134,8 @@ def _read_bmp(body: bytes) -> Header:
 
 
 def _read_tiff(body: bytes) -> Header:
-    """The header of a TIFF file. The orientation is always 1, because OpenCV itself rotates a TIFF
-    upright, whatever the flags."""
+    """Read the header of a TIFF file. The orientation is always 1, because OpenCV itself rotates a
+    TIFF upright, whatever the flags."""
     tags = read_tags(body)
     if DNG_VERSION in tags or tags.get(NEW_SUBFILE_TYPE, (0, 0))[1] & REDUCED:
         raise ImageError(

@@ -131,8 +131,8 @@ def critical_chunks(body: bytes, header: PngHeader, *, limited: bool = True) -> 
 
 
 def _check_chunk(view: memoryview, at: int) -> tuple[int, bytes]:
-    """End offset and type of the chunk at offset `at`. Raises ImageError for a truncated chunk or a
-    wrong checksum."""
+    """Return end offset and type of the chunk at offset `at`. Raises ImageError for a truncated
+    chunk or a wrong checksum."""
     if at + 12 > len(view):
         raise ImageError(
             Fault.DAMAGED,
