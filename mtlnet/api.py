@@ -126,17 +126,18 @@ class Model:
     ) -> Any:
         """Predict the features of one image, of a list of images, or of all images of a source.
 
-        `source`: an image file, its bytes, or pixels (H, W, 3) uint8 RGB give `Features`; a
-        list of these gives a list. A film, folder, pattern, recorded round, ROS 2 bag, webcam
-        number or address of a stream (all as text, as for `mtlnet predict`) gives an iterator,
-        which reads and predicts image by image. `camera`: a camera file or CameraParameters;
-        "model": the model's own; None: the model's own, with the mount of a film's camera estimated
-        from the film. `fov_y_deg`: vertical field of view of the images, if nothing else is known
-        about their camera. `topic`: topic with the pictures of a recording.
+        For an image file, its bytes, or pixels (H, W, 3) uint8 RGB, the result is `Features`; for a
+        list of images it is a list of `Features`. For a film, folder, pattern, recorded round, ROS
+        2 bag, webcam number or address of a stream (all as text, as for `mtlnet predict`) it is an
+        iterator, which reads and predicts image by image. `camera`: a camera file or
+        CameraParameters of the images; "model": the model's camera took them; None: the same,
+        except that the mount of a film's camera is estimated from the film. `fov_y_deg`: vertical
+        field of view of the images, if no `camera` is given. `topic`: topic with the pictures of a
+        recording.
 
         Raises UserError for a source that cannot be used (ImageError for one image). An iterator
-        raises it after the last image, if any image could not be used. Messages about the sources
-        found, and about skipped ones, go to the logger `mtlnet`.
+        raises UserError after the last image, if any image could not be used. Messages about the
+        sources found, and about skipped ones, go to the logger `mtlnet`.
         """
         lens = self._lens(camera, fov_y_deg)
         if isinstance(source, str | Path):
@@ -246,11 +247,10 @@ def load(
     """Load a model for prediction.
 
     `model`: a shipped model ("default", or "varied" for real roads and lanes of 2.8 to 4.3 m), the
-    name of a run in `runs/`, or the folder of a run.
-    `engine`: "openvino" or "torch". `precision`: "int8", "bf16" or "f32"; None: int8 if the model
-    has an int8 graph that passed its accuracy gate, else bf16 if the processor supports it, else
-    f32. `threads`: number of threads for one answer. Raises ModelError when the model is missing or
-    damaged.
+    name of a run in `runs/`, or the folder of a run. `engine`: "openvino" or "torch". `precision`:
+    "int8", "bf16" or "f32"; None: int8 if the model has an int8 graph that passed its accuracy
+    gate, else bf16 if the processor supports it, else f32. `threads`: number of CPU threads that
+    compute one image. Raises ModelError when the model is missing or damaged.
     """
     return Model(resolve_run(str(model)), engine, precision, threads)
 

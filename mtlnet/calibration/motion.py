@@ -30,8 +30,9 @@ MAX_CONDITION = 1e12
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion between two pictures: rotation of the camera (3,) rad, and the point towards which it
-    travels (2,), x and y in normalised coordinates, with its standard deviation."""
+    """Motion of a camera between two pictures: its `rotation` (3,) rad, and the point `towards`
+    (2,) which it travels, x and y in normalised coordinates. `towards_std` is the standard
+    deviation of this point."""
 
     rotation: FloatArray
     towards: FloatArray

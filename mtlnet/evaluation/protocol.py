@@ -59,9 +59,10 @@ def evaluate_protocol(
     entry `protocol` has the rows of the paper's table.
 
     A row is for a drive, a part of a drive, or all held-out rounds that are no drive. Its entry
-    `paper` has the paper's figures. `every`: evaluate every n-th frame only. Raises UserError for
-    another protocol and for data without the rounds of the protocol, ModelError for a model that
-    was trained on these rounds or on dirt-3.
+    `paper` has the paper's figures. `protocol`: must be "paper". `every`: evaluate every n-th frame
+    only. `report(done, total)` is called with numbers of frames. Raises UserError for another
+    protocol and for data without the rounds of the protocol, ModelError for a model that was
+    trained on these rounds or on dirt-3.
     """
     if protocol != PAPER:
         raise UserError(f"there is no protocol {protocol!r}; give {PAPER}")
@@ -123,11 +124,12 @@ def protocol_rows(
     every: int,
     held_out: dict[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """Return the rows of the table: drives, four intervals of heavy shadow, held-out rounds of nine
-    tracks.
+    """Return the rows of the table by name: drives, four intervals of heavy shadow, held-out rounds
+    of nine tracks.
 
-    `outputs` (N, K; columns: `split_outputs`); `rows`: the result of `drive_rows`; `held_out`: the
-    report on the held-out rounds that are no drive.
+    `outputs` (N, K; columns: `split_outputs`); `rows`: the result of `drive_rows`; `every`: the
+    frames are every n-th frame of the rounds; `held_out`: the report on the held-out rounds that
+    are no drive.
     """
     shaded = rows[SHADED]
     window = max(1, INTERVAL_FRAMES // every)
@@ -151,11 +153,12 @@ def protocol_rows(
 
 
 def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
-    """Return up to `INTERVALS` disjoint intervals of `window` frames with the largest mean shadow,
-    each as an array of frame indices, in order.
+    """Return up to four disjoint intervals of `window` frames with the largest mean shadow, each as
+    an array of frame indices (window,), in the order of the frames.
 
-    `shadow` (N,): share of the road in shadow. The intervals are chosen one after another. They are
-    shorter where N is too small for all of them.
+    `shadow` (N,): share of the road in shadow. The darkest interval is chosen first, then the
+    darkest one that does not overlap it, and so on. If N is too small for four intervals, they are
+    shorter.
     """
     window = max(1, min(window, len(shadow) // (2 * INTERVALS - 1)))
     sums = np.convolve(shadow.astype(np.float64), np.ones(window), mode="valid")

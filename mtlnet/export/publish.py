@@ -1,8 +1,8 @@
 """Publishes the model in a run's own folder when training ends: weights, OpenVINO graph, card.
 
-All files are moved into place together, after the graph has been compared with torch on real
-frames, and the card last: a run without a card has no finished model. Without OpenVINO no graph is
-written; an engine then converts the weights when it loads them, which needs torch.
+The graph is first compared with torch on frames of the dataset. Then all files are moved into place
+together, the card last, so that a run without a card has no finished model. Without OpenVINO no
+graph is written; an engine then converts the weights when it loads them, which needs torch.
 """
 
 import platform

@@ -1,7 +1,7 @@
 """Inference engines: OpenVINO by default, torch in float32 as the reference.
 
 An engine takes one camera image, uint8 RGB; normalisation is part of the graph. torch is imported
-only when the torch engine is requested: the image of the service does not contain it.
+only when the torch engine is requested, because the service's container does not have torch.
 """
 
 import json

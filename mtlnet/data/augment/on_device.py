@@ -1,9 +1,9 @@
 """Augments the images of a whole batch in torch, on a GPU.
 
 Parameters and labels are the same as on the CPU (`mtlnet.data.augment.pipeline`). The images differ
-as follows: shift, rotation and mirroring are one resampling, so that each pixel is interpolated
-once; pixel values are rounded once, at the end; the noise is new for each image instead of stored;
-there is no JPEG compression.
+as follows. Shift, rotation and mirroring are one resampling, so that each pixel is interpolated
+once. Pixel values are rounded once, at the end. The noise is computed anew for each image; on the
+CPU it is read from a stored array. There is no JPEG compression.
 """
 
 from functools import lru_cache

@@ -42,7 +42,8 @@ BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
 @dataclass(frozen=True)
 class AugmentParams:
-    """Augmentation parameters of B images; 0 leaves an image unchanged."""
+    """Augmentation parameters of B images. Where a parameter is 0, its change is not made; `colour`
+    is always applied."""
 
     shift: NDArray[np.float64]  # (B,) m to the left; until `resolve_lateral_shift` a share
     rotation: NDArray[np.int64]  # (B,) number of one of `ROTATIONS`

@@ -7,8 +7,8 @@ upright image. A wider image is cropped to the model's field of view
 (`mtlnet.inference.image_decoding.crop`). Alpha is dropped, grey becomes RGB, samples of 16 bits are
 reduced to 8.
 
-A service accepts JPEG and PNG (`read_header`, `decode_whole`). A file on this machine can be of
-another kind and is limited only by memory (`read_whole_image`, `decode_file`).
+The service accepts JPEG and PNG (`read_header`, `decode_whole`). A file on this machine can be of
+another kind and have up to 1 GiB and 256 million px (`read_whole_image`, `decode_file`).
 """
 
 from collections.abc import Iterator
