@@ -45,8 +45,8 @@ def marking_line(
 
 
 def to_pixels(points: NDArray[np.float64], camera: CameraParameters) -> NDArray[np.int32]:
-    """Return the pixels (M, 2), in an image enlarged twice, of the road points in `points` (N, 2),
-    m in the car frame, that the camera sees. M is their number."""
+    """Return the pixels (M, 2), in an image of twice the size of the camera's images, of the M
+    points in `points` (N, 2) that the camera sees. `points` lie on the road, m in the car frame."""
     road = np.column_stack([points, np.full(len(points), -camera.cg_height_m)])
     pixels = camera.project(road)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -61,9 +61,9 @@ def draw_overlay(
     truth: tuple[Distances, float],
     prediction: tuple[Distances, float],
 ) -> Image:
-    """Draw markings on a frame (H, W, 3) RGB, enlarged twice, and on a view from above to its
-    right; returns the picture (2 H, 2 W + 160, 3). True markings are green, predicted markings
-    orange.
+    """Draw markings on a frame (H, W, 3) RGB, enlarged to twice its size, and on a view from above
+    to its right; returns the picture (2 H, 2 W + 160, 3). True markings are green, predicted
+    markings orange.
 
     `truth` and `prediction`: distances (m) by marking, and angle (rad). Both are drawn with the
     road's true `curvature` (1/m, positive to the left), which is not predicted.
