@@ -283,18 +283,13 @@ def _model_of(config: CompareConfig, perception: str) -> str:
 def _files_of(controller: str) -> list[Path]:
     """Paths of a controller's module, or of the file with a user's class, and of its weights."""
     if controller in CONTROLLERS:
-        module = CONTROLLERS[controller].factory.partition(":")[0]
+        module = sys.modules[CONTROLLERS[controller].factory.partition(":")[0]]
         weights = SHIPPED / controller / WEIGHTS
-        return [_module_file(module), *filter(Path.is_file, [weights])]
+        return [Path(str(module.__file__)), *filter(Path.is_file, [weights])]
     if is_actor(Path(controller)):
         return [Path(controller) / WEIGHTS]
     place = controller.rpartition(":")[0]
-    return [Path(place) if place.endswith(".py") else _module_file(place)]
-
-
-def _module_file(module: str) -> Path:
-    """Path of an imported module's file."""
-    return Path(str(sys.modules[module].__file__))
+    return [Path(place if place.endswith(".py") else str(sys.modules[place].__file__))]
 
 
 def model_hash(run: str) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from simulator.link.layout import IMAGE_OFFSET, MESSAGE_ALIGNMENT, STATE, Block
 from simulator.link.segment import Segment
 from simulator.link.sync import futex
-from simulator.link.sync.seqlock import DAMAGED, NOTHING, publish, spin_until_new, try_read
+from simulator.link.sync.seqlock import DAMAGED, READ, TORN, publish, spin_until_new, try_read
 
 SPIN_COUNT = 30_000
 """Number of polls before a receiver sleeps: about 20 us, the duration of a wake-up."""
@@ -59,7 +59,7 @@ class Receiver:
     def __init__(self, segment: Segment, block: Block, image_bytes: int = 0) -> None:
         self._buffer = _MessageBuffer(segment, block, image_bytes)
         self._seen = 0
-        self.damaged = False
+        self.damaged = self.torn = False
         self.record, self.image = self._buffer.record, self._buffer.image
 
     def poll(self) -> bool:
@@ -67,11 +67,14 @@ class Receiver:
         whether a message was copied.
 
         Sets `damaged` to True if the message has a wrong checksum, that is, if its writer violates
-        the protocol. The contents of `record` are then undefined.
+        the protocol. The contents of `record` are then undefined. They are undefined as well while
+        `torn` is True: the writer wrote during the copy, and no message was copied.
         """
         outcome, self._seen = try_read(*self._buffer.arrays, self._seen)
+        came = bool(outcome in (READ, DAMAGED))
         self.damaged = outcome == DAMAGED
-        return bool(outcome != NOTHING)
+        self.torn = outcome == TORN or (self.torn and not came)
+        return came
 
     def wait(self, seconds: float) -> bool:
         """Wait at most about `seconds` for a new message and receive it as `poll` does. Returns

@@ -92,6 +92,10 @@ class Link:
         real-time mode. Raises LinkError if the server has sent no message yet."""
         self._check_open()
         self._receive()
+        until = time.monotonic() + self._timeout_s
+        while self._inbox.torn:
+            self._receive(POLL_INTERVAL_S)
+            self._check_time(until)
         return self._message()
 
     def quit(self) -> None:
@@ -138,11 +142,15 @@ class Link:
         self._outbox.send()
         until = time.monotonic() + self._timeout_s
         while not (self._receive(POLL_INTERVAL_S) and self._answered()):
-            if time.monotonic() > until:
-                raise LinkTimeout(
-                    f"{self._server} is running, but has not answered within {self._timeout_s:g} s"
-                    "; is it stopped, or too busy? A longer timeout_s waits longer"
-                )
+            self._check_time(until)
+
+    def _check_time(self, until: float) -> None:
+        """Raise LinkTimeout after the monotonic time `until` (s)."""
+        if time.monotonic() > until:
+            raise LinkTimeout(
+                f"{self._server} is running, but has not answered within {self._timeout_s:g} s"
+                "; is it stopped, or too busy? A longer timeout_s waits longer"
+            )
 
     def _receive(self, seconds: float = 0.0) -> bool:
         """Return whether a message arrived within `seconds`. Raises ServerDied, DamagedMessage."""

@@ -32,7 +32,7 @@ Sequence = NDArray[np.uint32]
 
 FNV_OFFSET, FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
 
-NOTHING, READ, DAMAGED = 0, 1, 2
+NOTHING, READ, DAMAGED, TORN = 0, 1, 2, 3
 MAX_TRIES = 100
 
 
@@ -78,10 +78,11 @@ def try_read(
 ) -> tuple[int, int]:
     """Copy the message into `local` if it is complete and newer than the sequence number `seen`.
 
-    Returns (NOTHING, READ or DAMAGED; sequence number of the message). The function gives up after
-    100 tries, so it never blocks. After DAMAGED, or if it gives up, the contents of `local` are
-    undefined.
+    Returns (NOTHING, READ, DAMAGED or TORN; sequence number of the message). The function gives up
+    after 100 tries, so it never blocks. TORN: the writer wrote during a copy, and the function gave
+    up. After DAMAGED and TORN the contents of `local` are undefined; NOTHING leaves them unchanged.
     """
+    outcome = NOTHING
     for _ in range(MAX_TRIES):
         begun = load_acquire(sequence, 0)
         if begun == seen:
@@ -96,7 +97,8 @@ def try_read(
         if load_relaxed(sequence, 0) == begun:
             whole = checksum(local) == local[local.shape[0] - 1]
             return (READ if whole else DAMAGED), int(begun)
-    return NOTHING, seen
+        outcome = TORN
+    return outcome, seen
 
 
 @compiled
