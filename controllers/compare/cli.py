@@ -34,10 +34,11 @@ def compare(config: CompareConfig, as_json: bool) -> None:
 
 @options(TuneConfig)
 def tune(config: TuneConfig, as_json: bool) -> None:
-    """Search the parameters of controllers, with the same number of drives for each controller.
+    """Search for the best parameters of controllers, with the same number of drives for each
+    controller.
 
-    `controllers drive` and `controllers compare` read the written file with --parameters. The same
-    command continues an interrupted search.
+    The file with the found parameters is read by `controllers drive --parameters` and `controllers
+    compare --parameters`. The same command continues an interrupted search.
     """
     from controllers.compare.tune import tune as run
 

@@ -48,7 +48,8 @@ class CompareConfig:
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """A search for the parameters of several controllers, with equal numbers of drives for each."""
+    """A search for the parameters of several controllers, with the same number of drives for each
+    controller."""
 
     out: Annotated[Path, "File for the parameters found."] = Path("tuned.json")
     controllers: Annotated[

@@ -11,9 +11,11 @@ COLUMNS = ("t", "d", "angle", "perceived_d", "perceived_angle")
 
 
 class CurveRecorder:
-    """An observer that records the curves of a drive on a track with one lane.
+    """An `Observer` that records the true and the perceived offset and angle in each step of a
+    drive.
 
-    The offset from the track's centre is then also the offset from the lane's centre.
+    The true offset is recorded from the track's centre. On a track with one lane, as in a
+    comparison, it equals the offset from the lane's centre.
     """
 
     def __init__(self) -> None:
@@ -24,16 +26,19 @@ class CurveRecorder:
         self._rows.append((now.time_s, now.to_middle, now.angle, seen, perceived.angle))
 
     def curves(self) -> dict[str, list[float | None]]:
-        """Return the curves of the steps so far, in the format of `curves_of`."""
+        """Return the recorded curves as lists by name: t (s), d, angle, perceived_d and
+        perceived_angle (m, rad), with at most 400 points. None stands for an offset that was not
+        perceived."""
         return curves_of(np.array(self._rows))
 
 
 def curves_of(table: FloatArray) -> dict[str, list[float | None]]:
-    """Return the columns of `table`, called `COLUMNS`, thinned to at most `MAX_POINTS` points.
+    """Return the columns of `table` (n, 5) as lists by name, thinned to at most 400 points.
 
-    `table` (n, 5) has a row for each control step: s, m, rad, m, rad. NaN (nothing was perceived)
-    becomes None. The steps are divided into parts of equal length, and each point is the step with
-    the largest offset in its part, so that no peak is lost.
+    A row of `table` is a control step. The columns are t (s), d (m), angle (rad), perceived_d (m)
+    and perceived_angle (rad). NaN, where nothing was perceived, becomes None. The steps are divided
+    into parts of equal length. Each point is the step with the largest |d| in its part, so that no
+    peak of d is lost.
     """
     chosen = [
         part[np.argmax(np.abs(table[part, 1]))]

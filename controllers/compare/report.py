@@ -28,16 +28,18 @@ TRUTH, PERCEIVED = "#2a9d5c", "#e07a2e"
 
 
 def spread(values: list[float], digits: int) -> str:
-    """The mean of `values`, and their standard deviation if there are several."""
+    """Return the mean of `values` as text with `digits` decimals, with their standard deviation
+    ("0.99 ± 0.01") if there are several values."""
     mean = f"{np.mean(values):.{digits}f}"
     return mean if len(values) == 1 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 
 
 def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return the titles and rows of a table of scores per step: a row for each track, a column for
-    each controller.
+    """Return the column titles and the rows of a table of scores per step, with a row for each
+    track and a column for each controller.
 
-    A track that was driven over the paper's number of steps also shows the paper's scores.
+    `drives` are entries of `results.json` with the same perception and disturbance. If a track was
+    driven over the paper's number of steps, the table also has the paper's scores.
     """
     controllers = list(dict.fromkeys(entry["controller"] for entry in drives))
     tracks = list(dict.fromkeys(entry["track"] for entry in drives))
@@ -61,7 +63,11 @@ def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
 
 
 def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
-    """Yield a row with the columns `FIGURES` for each track and controller, over all seeds."""
+    """Yield a table row for each track and controller in `drives`, entries of `results.json`.
+
+    The titles of the columns are FIGURES. Each cell combines the drives of all seeds: it has a
+    mean, an extreme value, or a range.
+    """
     pairs = dict.fromkeys((entry["track"], entry["controller"]) for entry in drives)
     for track, controller in pairs:
         results = _results(drives, track, controller)
@@ -85,7 +91,8 @@ def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
 
 
 def write_report(out: Path, content: dict[str, Any]) -> Path:
-    """Write the HTML page into the folder `out`; returns its path."""
+    """Write `content`, a result of `compare`, as an HTML page into the folder `out`; return the
+    page's path."""
     sections = []
     for (perception, disturbance), drives in groups(content):
         head, rows = score_table(drives)
@@ -116,8 +123,11 @@ def write_report(out: Path, content: dict[str, Any]) -> Path:
 
 
 def driving_curves(curves: dict[str, list[float | None]]) -> tuple[Markup, Markup]:
-    """Return a chart of the offset (m) and one of the angle (rad) over time (s), true and
-    perceived, as in the paper's figures 12 and 13."""
+    """Return two charts over time (s) as in the paper's figures 12 and 13: the true and the
+    perceived offset (m), and the true and the perceived angle (rad).
+
+    `curves` is a result of `curves_of`.
+    """
     columns = {
         name: np.array([np.nan if value is None else value for value in values])
         for name, values in curves.items()

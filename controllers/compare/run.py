@@ -1,9 +1,9 @@
 """The drives of a comparison, and the file with their results.
 
-All drives with exact states (perception `truth`) of a controller with `update_batch` are made at
-once; all other drives are made one by one. `results.json` is {"version", "settings", "drives":
-[...]} and is written after each batch. A drive whose result is in the file is not driven again,
-unless its controller or model has changed.
+Drives with exact states (perception `truth`) are made at once if their controller has
+`update_batch`; all other drives are made one by one. `results.json` is {"version", "settings",
+"drives": [...]} and is written after each batch. A drive whose result is in the file is made again
+only if its controller, tuned parameters, road or model has changed.
 """
 
 import hashlib
@@ -38,9 +38,8 @@ SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
 """Settings that are equal for all drives of a file."""
 
 Progress = Callable[[float, int, str], None]
-"""A function that is called with the number of drives done (parts of a drive count as fractions),
-the total number of drives, and the name of the present drive or controller. Several threads call
-it."""
+"""A function that is called, by several threads, with the number of drives done (parts count as
+fractions), the total number of drives, and the name of the present drive or controller."""
 Report = Callable[[float, str], None]
 """A function that is called with the number of drives done and the name of the present drive."""
 Driven = dict[str, Any] | UserError
@@ -64,7 +63,7 @@ class Cell:
 
 
 def cells(config: CompareConfig) -> list[Cell]:
-    """Return all drives, ordered by track. Raises UserError for an empty list or no seed."""
+    """Return all drives, ordered by track. Raises UserError if an option has no name or seed."""
     if config.seeds < 1:
         raise UserError(f"{config.seeds} seeds; give 1 or more")
     disturbances = list(DISTURBANCES) if config.disturb else [UNDISTURBED]
@@ -79,10 +78,8 @@ def cells(config: CompareConfig) -> list[Cell]:
 
 
 def names(text: str, what: str) -> list[str]:
-    """Return the names in `text`, separated by commas, without repetition.
-
-    Raises UserError for an empty list; `what` is the name of the option.
-    """
+    """Return the names in `text`, separated by commas, without repetition. Raises UserError if
+    there is no name; `what` is the name of the option."""
     found = list(dict.fromkeys(filter(None, (name.strip() for name in text.split(",")))))
     if not found:
         raise UserError(f"--{what} names nothing; give names with commas between them")
@@ -90,12 +87,12 @@ def names(text: str, what: str) -> list[str]:
 
 
 def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str, Any]:
-    """Make all drives of the comparison (cells) that have no result in `config.out`; returns the
-    results of all drives.
+    """Make the drives whose results are missing in `config.out`; return the content of
+    `results.json`, with only the drives of this comparison.
 
-    Raises UserError before the first drive for an unknown name, a folder with results of other
-    settings, or a folder to which another process writes. Raises ContactsUnavailable after the last
-    drive if a car touched something; the results of the other drives are in `results.json`.
+    Raises UserError before the first drive for an unknown name, results of other settings, or a
+    folder to which another process writes. Raises ContactsUnavailable after the last drive if a car
+    touched something; the results of the other drives are in `results.json`.
     """
     todo = cells(config)
     for controller in dict.fromkeys(cell.controller for cell in todo):
@@ -147,11 +144,8 @@ def _drive_missing(
 def drive_cells(
     config: CompareConfig, missing: list[Cell], report: Report
 ) -> Iterator[list[tuple[Cell, Driven]]]:
-    """Drive the cells; yields batches of their results.
-
-    `report` is called with the number of drives done (parts of a drive count as fractions) and the
-    name of the present drive or controller.
-    """
+    """Make the `missing` drives; yield batches of them with their results. `report` is called with
+    the number of drives done (parts count as fractions) and the name of the drive or controller."""
     tasks = tasks_of(config, missing)
     groups = groups_at_once(config, tasks)
     done = 0
@@ -170,7 +164,7 @@ def drive_cells(
 
 
 def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
-    """Return the configuration and the disturbance of each cell's drive."""
+    """Return the `DriveConfig` and the `Disturbance` of each drive in `todo`."""
     widths = {
         name: find_track(name, config.tracks_dir).width
         for name in dict.fromkeys(cell.track for cell in todo)
@@ -204,7 +198,8 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
 
 
 def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
-    """Return, for each controller with `update_batch`, the cells that `drive_many` can drive."""
+    """Group by controller the drives that `drive_many` can make; their controllers have
+    `update_batch`."""
     groups: dict[str, list[Cell]] = {}
     for cell, (drive_config, _) in tasks.items():
         if can_join(drive_config):
@@ -221,7 +216,7 @@ def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, 
 
 
 def entry_of(cell: Cell, outcome: Outcome) -> Driven:
-    """Convert an outcome of `drive_many`: the result, with the curves if the seed is 0."""
+    """Return the result or the error of `outcome`; the result has the curves if the seed is 0."""
     if isinstance(outcome.result, UserError):
         return outcome.result
     curves = {"curves": curves_of(outcome.curves)} if cell.seed == 0 else {}
@@ -229,7 +224,8 @@ def entry_of(cell: Cell, outcome: Outcome) -> Driven:
 
 
 def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> Driven:
-    """Make one drive and return its result; it includes the curves if the seed is 0."""
+    """Make one drive; return its result, with curves if the seed is 0, or ContactsUnavailable.
+    `progress` is called with the steps done and their total number."""
     recorder = CurveRecorder()
     config, disturbance = task
     try:
@@ -241,7 +237,7 @@ def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> 
 
 
 def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
-    """Read a controller's tuned parameters; {} without a file or without an entry in it."""
+    """Read a controller's parameters in `config.parameters`; {} if they are not in this file."""
     if config.parameters is None:
         return {}
     try:
@@ -293,21 +289,22 @@ def _files_of(controller: str) -> list[Path]:
 
 
 def model_hash(run: str) -> str:
-    """SHA-256 of the weights of a run's model."""
+    """Return the SHA-256 of the weights of a run, given by its folder or name."""
     from mtlnet.inference.model_card import read_card, resolve_run
 
     return read_card(resolve_run(run)).model_hash
 
 
 def service_model_hash(url: str) -> str:
-    """SHA-256 of the weights of the service at `url`. Raises UserError if it does not answer."""
+    """Return the SHA-256 of a service's weights. Raises UserError if `url` does not answer."""
     service = ServiceModel(url)
     service.close()
     return service.model_hash
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
-    """Read the results so far. Raises UserError for a file of other settings or version."""
+    """Read `results.json`, or make its content if there is no file at `path`. Raises UserError for
+    a file whose settings or version differ."""
     settings = {name: getattr(config, name) for name in SETTINGS}
     if not path.exists():
         return {"version": VERSION, "settings": settings, "drives": []}
@@ -342,7 +339,7 @@ def _report_share(report: Report, done: int, name: str, step: int, steps: int) -
 
 
 def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
-    """Yield the drives grouped by (perception, disturbance), in their order in `content`."""
+    """Yield ((perception, disturbance), drives) for the drives in a result of `compare`."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for entry in content["drives"]:
         found.setdefault((entry["perception"], entry["disturbance"]), []).append(entry)

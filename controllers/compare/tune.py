@@ -1,9 +1,9 @@
-"""A search for the parameters of several controllers, with equal budgets of drives.
+"""A search for the parameters of several controllers, with the same number of drives for each.
 
 The first candidate is the controller's own parameters. The candidates of the first third of the
 budget are log-uniformly random over the whole ranges. All later candidates are random around the
-best candidate so far, with a falling spread. The file is written after each candidate, so the same
-command continues an interrupted search.
+best candidate so far, at distances that shrink in proportion to the remaining budget. The file
+`config.out` is written after each candidate, so the same command continues an interrupted search.
 """
 
 import json
@@ -37,9 +37,12 @@ Progress = Callable[[int, int, str], None]
 
 
 def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]:
-    """Search the parameters; returns the content of `config.out`.
+    """Search for the best parameters of each controller; return the content of the file
+    `config.out`.
 
-    Raises UserError for an unknown name, or a file of other settings.
+    The content is {"version", "settings", "controllers"}; it has the parameters and the reward per
+    step of each controller's best candidate, and all candidates tried. Raises UserError for an
+    unknown name, or a file of other settings.
     """
     controllers = names(config.controllers, "controllers")
     for controller in controllers:
@@ -83,8 +86,11 @@ def propose(
     budget: int,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """Return the next candidate after the candidates in `tried`; {} stands for the controller's own
-    parameters."""
+    """Return the next candidate, parameters by name; {} stands for the controller's own parameters.
+
+    `ranges` has the least and the greatest value of each parameter. `tried` has the candidates so
+    far, {"parameters", "reward"}. `budget` is the number of all candidates.
+    """
     if not tried:
         return {}
     best = max(tried, key=lambda one: float(one["reward"]))["parameters"]
