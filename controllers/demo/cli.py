@@ -14,7 +14,8 @@ def demo(config: DemoConfig, as_json: bool) -> None:
     """Show the shipped model on a first drive, then run the whole pipeline: collect, train,
     evaluate, serve, predict, drive, and an HTML report.
 
-    The same command continues an interrupted demo. The exit code is 1 when a limit is missed.
+    The same command continues an interrupted demo. The exit code is 1 when a result of the trained
+    model misses its limit.
     """
     from controllers.demo.process import stop_on_sigterm
     from controllers.demo.report import check_limits, print_tables, write_report

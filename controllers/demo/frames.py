@@ -12,7 +12,10 @@ from trackfeatures import MARKINGS, RoadClass, localise
 
 @dataclass(frozen=True, slots=True)
 class PostedFrame:
-    """One held-out frame (JPEG), its labels (m, rad, 1/m), and the answer of the service."""
+    """One held-out frame (JPEG), its labels, and the answer of the service.
+
+    The distances and the offset are in m, the angle in rad, the curvature in 1/m.
+    """
 
     jpeg: bytes
     round_id: str
@@ -32,8 +35,11 @@ class PostedFrame:
 
 
 def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
-    """Return `count` different frame numbers, random, equally many of each round, in ascending
-    order."""
+    """Return the indices of `count` random frames in ascending order, an equal share from each
+    round.
+
+    The result is shorter if a round has fewer frames than its share.
+    """
     rounds = frames.labels.round
     shares = np.array_split(np.arange(count), len(np.unique(rounds)))
     chosen: list[int] = []

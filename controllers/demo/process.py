@@ -1,6 +1,6 @@
 """The project's commands as child processes that run to their end, or serve until they are stopped.
 
-After Ctrl-C or SIGTERM the child processes have `STOP_LIMIT_S` to end by themselves.
+A child process that has not ended 10 s after Ctrl-C or SIGTERM is killed.
 """
 
 import signal

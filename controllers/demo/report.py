@@ -45,7 +45,10 @@ CURVE_COLOURS = {"distance": "#22bb66", "angle": "#ee8822", "type": "#3366cc"}
 
 @dataclass(frozen=True, slots=True)
 class LimitCheck:
-    """A result of the demo, with its limit and the result of the baseline."""
+    """A result of the demo, with its limit and the result of a baseline.
+
+    The baseline always predicts the mean of the training labels, or the most frequent class.
+    """
 
     what: str
     """Name of the result, with its unit."""
@@ -74,7 +77,12 @@ def check_limits(result: DemoResult) -> list[LimitCheck]:
 
 
 def check_evaluation(evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """Compare each feature's error in an evaluation with its limit and the baseline's error."""
+    """Compare each feature's error in an evaluation with its limit and with the error of a
+    baseline.
+
+    `evaluation` is the output of `mtlnet evaluate --json`. The baseline always predicts the mean of
+    the training labels, or the most frequent class of the road.
+    """
     baseline = evaluation["baseline"]
     rows = []
     for name in MARKINGS:
@@ -96,10 +104,11 @@ def _check_error(what: str, error: float, mean: float, limit: float | None) -> L
 
 
 def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[LimitCheck]:
-    """Compare the mean errors of the service's answers with their limits: the 95th percentiles of
-    the evaluation's errors.
+    """Compare the service's mean errors of angle and offset over the posted `frames` with their
+    limits.
 
-    A service with another camera or another model exceeds the limits by far.
+    The limits are the 95th percentiles of the errors in `evaluation`. A service with another camera
+    or another model exceeds them by far.
     """
     found = []
     for what, name, pairs in (
@@ -119,14 +128,19 @@ def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[
 
 
 def check_drive(drive: dict[str, Any]) -> LimitCheck:
-    """Check the drive on the service's answers: the car must stay on the road, near its lane."""
+    """Check the drive on the service's answers: the car must stay on the road, at a mean distance
+    of at most 0.3 m from the centre of its lane.
+
+    `drive` is the output of `controllers drive --json`.
+    """
     mean = drive["mean_abs_d_m"]
     stayed = drive["ended"] is None and mean <= MAX_MEAN_ABS_D_M
     return LimitCheck("drive: mean |d| (m)", mean, None, MAX_MEAN_ABS_D_M, stayed)
 
 
 def check_cells(check: LimitCheck) -> tuple[str, ...]:
-    """Return the cells of a check's row; the columns are `LIMIT_COLUMNS`."""
+    """Return the cells of a check's table row: name, mean error, limit, error of the baseline,
+    ratio of the two errors, and "yes" or "NO"."""
     limit = "" if check.limit is None else f"{check.limit:.4g}"
     mean = "" if check.mean is None else f"{check.mean:.4f}"
     ratio = "" if check.mean is None else f"{check.figure / check.mean:.2f}"

@@ -47,7 +47,7 @@ class DemoResult:
     """Frames with the answers of the shipped model."""
 
     def as_json(self) -> dict[str, Any]:
-        """The fields as values for JSON, without the images."""
+        """Return the fields as values for JSON, without the images."""
         content = asdict(self)
         for one in content["asked"] + content["shipped"]:
             del one["jpeg"]
@@ -150,7 +150,11 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
 
 
 def write_soft_parameters(path: Path) -> Path:
-    """Write the weights of `lqr-preview` for a briefly trained model, a file for `--parameters`."""
+    """Write a parameter file for `controllers drive --parameters` to `path`; return `path`.
+
+    The weights of `lqr-preview` in the file give low gains, for the errors of a model that was
+    trained for minutes.
+    """
     parameters = asdict(WEIGHTS_BRIEFLY_TRAINED)
     write_json(path, {"controllers": {"lqr-preview": {"parameters": parameters}}})
     return path
