@@ -1,7 +1,8 @@
-"""Closed-loop driving: perceive, steer, step, score. SI units, track frame, left positive.
+"""Closed-loop driving: each control step perceives the road, steers, moves the car and adds its
+reward. SI units, track frame, left positive.
 
-The throttle is held open loop, as in the paper, unless other `Pedals` are given. The result of
-`run_lap` depends only on the reset of the world, the controller, the pedals and the perception.
+The throttle is constant, as in the paper, unless other `Pedals` are given. The result of `run_lap`
+depends only on the reset of the world, the controller, the pedals and the perception.
 """
 
 import math
@@ -62,12 +63,12 @@ class Pedals(Protocol):
 
     @property
     def mean_error(self) -> float | None:
-        """Mean absolute speed error (m/s); None without a set-point."""
+        """Mean absolute difference (m/s) from the set speed; None for pedals that hold no speed."""
 
     def __call__(
         self, now: CarState, traffic: Traffic, perceived: Perceived
     ) -> tuple[float, float, int]:
-        """Throttle (0 to 1), brake (0 to 1) and gear for the present control step."""
+        """Return throttle (0 to 1), brake (0 to 1) and gear for the present control step."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class HeldThrottle:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """The score of a drive and its other figures."""
+    """The score of a drive, its offsets, speeds and laps, and how it ended."""
 
     steps: int
     """Control steps driven; fewer than `steps_asked` if the drive ended early."""
@@ -128,11 +129,12 @@ class DriveResult:
     JSON) without a set-point."""
 
     def per_step(self, reward: str) -> float:
-        """The mean over `steps_asked` of the reward called `reward`, one of `REWARDS`."""
+        """Return the mean of the reward called `reward`, paper or quadratic, over the requested
+        steps."""
         return self.score_per_step if reward == "paper" else self.quadratic_per_step
 
     def as_json(self) -> dict[str, Any]:
-        """The fields as values for JSON."""
+        """Return the fields as values for JSON."""
         values = asdict(self)
         if self.speed_error_m_s is None:
             del values["speed_error_m_s"]
@@ -155,9 +157,10 @@ def run_lap(
 ) -> DriveResult:
     """Drive `steps` control steps from the world's present state, or until the episode ends.
 
-    `lane_centre` (m, left positive) is the line from which `mean_abs_d_m` is measured. `noisy` is
-    copied to the result: whether the perception has errors. `record` is called with the state and
-    the steering action of each step. The reward of a step is the reward of the state after it.
+    `lane_centre` (m, left positive) is the line from which `mean_abs_d_m` is measured. `noisy`
+    tells whether the perception has errors; it is only copied to the result. `record` is called
+    with the state and the steering action of each step. The reward of a step is the reward of the
+    state after it.
     """
     memory = OffsetMemory(round(HOLD_S * world.frequency_hz))
     start_m, slowed_steps, ended = world.state.odometer_m, 0, None
@@ -188,7 +191,7 @@ def run_lap(
 
 
 def check_reward(name: str) -> None:
-    """Raise UserError unless `name` is one of `REWARDS`."""
+    """Raise UserError unless `name` is "paper" or "quadratic"."""
     if name not in REWARDS:
         raise UserError(f"there is no reward {name!r}; use one of: {', '.join(REWARDS)}")
 
@@ -206,15 +209,15 @@ def throttle_and_brake(traffic: Traffic, now: CarState, throttle: float) -> tupl
 
 
 def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float]:
-    """Return throttle and brake that slow the car down to `LOST_SPEED`; if `speed` (m/s) is lower,
-    return them unchanged."""
+    """Return throttle and brake (0 to 1) that slow the car down to 5 m/s. If `speed` (m/s) is not
+    above 5, return `throttle` and `brake` unchanged."""
     if speed > LOST_SPEED:
         return 0.0, max(brake, LOST_BRAKE)
     return throttle, brake
 
 
 class OffsetMemory:
-    """Replaces the offset in steps without a perceived offset."""
+    """Supplies an offset in steps without a perceived one: the last offset, and after a time 0."""
 
     def __init__(self, hold_steps: int) -> None:
         self.blind_steps = 0
@@ -262,7 +265,10 @@ class Driven:
     noisy: bool = False
 
     def result(self, steps: int, road: Road, lane_centre: float, frequency_hz: int) -> DriveResult:
-        """The result of a drive of which `steps` control steps were requested."""
+        """Return the result of a drive of which `steps` control steps were requested.
+
+        `lane_centre` is the line to follow, m left of the track's centre.
+        """
         driven, ended = len(self.after), self.ended is not None
         offsets = abs(self.after[:, 0] - lane_centre)
         score, quadratic = sum_rewards(self.after, lane_centre, road.half_width, ended)
@@ -294,8 +300,9 @@ def sum_rewards(
 ) -> tuple[float, float]:
     """Return the sums of `step_reward` and `quadratic_reward` over the n steps of a drive.
 
-    `after` (n, 5) is the field of `Driven`; `lane_centre` and `half_width` (of the track) are in m.
-    `ended`: whether the last step ended the drive.
+    `after` (n, 5) has to_middle (m), angle (rad), vx and vy (m/s) after each step, and the steering
+    action. `lane_centre` and `half_width` (of the track) are in m. `ended`: whether the last step
+    ended the drive.
     """
     score, quadratic = 0.0, 0.0
     for k in range(len(after)):
@@ -312,10 +319,10 @@ x, y and z in m."""
 
 
 class DriveLog:
-    """CSV log with a row for each control step and the columns of the laps recorded in TORCS.
+    """CSV log of a drive: a row for each control step has the state before it and the steering
+    action.
 
-    A row has the state before the control step and the steering action. The row is complete when
-    `write` returns.
+    The columns are `COLUMNS`, as in the logs of the laps recorded in TORCS.
     """
 
     def __init__(self, file: TextIO) -> None:

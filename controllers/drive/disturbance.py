@@ -70,7 +70,11 @@ class Disturbance:
         return car
 
     def world(self, road: Road, *, traffic: int, frequency_hz: int, seed: int) -> World:
-        """Return a world with the car of `seed`, and with side wind if `wind` is set."""
+        """Return a world whose car is `car(seed)`, with side wind if `wind` is set.
+
+        `traffic` is the number of other cars, `frequency_hz` the number of control steps per
+        second.
+        """
         car = self.car(seed)
         if self.wind:
             gusts = self.gusts(1.0 / frequency_hz, seed)
@@ -78,18 +82,20 @@ class Disturbance:
         return World(road, traffic=traffic, frequency_hz=frequency_hz, car=car)
 
     def controller(self, controller: Controller, seed: int) -> Controller:
-        """Return `controller`; if `noise` is set, its observations get the noise of `seed`."""
+        """Return `controller`. If `noise` is set, errors that depend on `seed` are added to each
+        observation that it receives."""
         if not self.noise:
             return controller
         return NoisySensors(controller, self.noise_rng(seed))
 
     def gusts(self, dt: float, seed: int) -> "Gusts":
-        """Return the side wind of the seed `seed` for control steps of `dt` s."""
+        """Return the random side wind that belongs to `seed`, for control steps of `dt` s."""
         return Gusts(dt, np.random.default_rng([seed, 4]))
 
     def noise_rng(self, seed: int) -> np.random.Generator:
-        """Return the generator of the noise. The noise of a step is NOISE_STD times five standard
-        normal numbers."""
+        """Return the random generator of the sensor noise. A step takes five standard normal
+        numbers from the generator and multiplies them by NOISE_STD (offset, angle, vx, vy, yaw
+        rate)."""
         return np.random.default_rng([seed, 6])
 
 
@@ -167,8 +173,10 @@ class WindyWorld(World):
 def push(
     motion: FloatArray, yaw: float, vx: float, wind: float, mass: float, frequency_hz: int
 ) -> None:
-    """Add the effect of a side `wind` (m/s) over one control step to the velocity in `motion`
-    (MOTION,), world frame. The car has the mass `mass` kg, the yaw `yaw` rad, the speed `vx` m/s.
+    """Add the effect of a side `wind` (m/s, positive from the right) over a control step of 1 /
+    `frequency_hz` s to the velocity in `motion` (13,), world frame.
+
+    The car has the mass `mass` (kg), the yaw `yaw` (rad) and the forward speed `vx` (m/s).
     """
     change = AIR_DENSITY * SIDE_FORCE_M2 * wind * abs(vx) * 0.5 / mass / frequency_hz
     motion[7] -= change * math.sin(yaw)

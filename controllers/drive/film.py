@@ -33,10 +33,10 @@ TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 
 
 class DriveFilm:
-    """Draws a picture for each control step and writes it to `film`.
+    """Draws a picture for each control step and writes it to the video file `film`.
 
-    With a camera perception the film shows its images and its answers. Without one (`perception` is
-    None) `camera` renders the images.
+    With a camera perception the picture shows this perception's image and answer. If `perception`
+    is None, `camera` renders the image, and only the true markings are drawn.
     """
 
     def __init__(
@@ -98,10 +98,11 @@ def caption(text: str, width: int) -> Image:
 
 
 def curves(values: NDArray[np.float64], length: int, width: int, span: float, title: str) -> Image:
-    """Draw the curves of the true and perceived `values` (n, 2): an image (CURVE_HEIGHT, width, 3).
+    """Draw a curve of the true and one of the perceived `values` (n, 2); return an RGB image (90,
+    width, 3).
 
-    The image has room for `length` values and the last value is at its right edge. `span` is the
-    value at the upper edge; up is positive (left). NaN leaves a gap.
+    The image has room for `length` steps, and the last step is at its right edge. `span` is the
+    value at the upper edge, in the unit of `values`; up is positive (left). NaN leaves a gap.
     """
     strip = np.full((CURVE_HEIGHT, width, 3), BACK, np.uint8)
     middle = CURVE_HEIGHT // 2

@@ -98,10 +98,11 @@ def drive_many(
     parameters: Mapping[str, float] | None = None,
     report: Report | None = None,
 ) -> Iterator[list[Outcome]]:
-    """Drive the `tasks`, which all have the same controller; yields batches of their outcomes.
+    """Make the drives `tasks`, which all have the same controller; yield their outcomes in batches.
 
-    `parameters` replace the controller's parameters in the files that the configurations name.
-    Raises UserError for an unknown name, a start outside the road, and an error of `update_batch`.
+    `parameters`, if given, are used instead of the parameters in the file that a configuration
+    names. `report` is called with the number of drives done. Raises UserError for an unknown name,
+    a start outside the road, and an error of `update_batch`.
     """
     rides = _check(tasks)
     config = tasks[0][0]

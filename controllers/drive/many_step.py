@@ -1,6 +1,7 @@
-"""The compiled control step of many drives with exact states; each car is a row of a fleet.
+"""The compiled control step of many drives with exact states.
 
-Between `command_rides` and `observe_rides` the cars move (`simulator.world.control_step`). SI
+A drive is called a ride, and its car is a row of a `Fleet`. A control step consists of
+`command_rides`, the motion of the cars (`simulator.world.control_step`), and `observe_rides`. SI
 units, track frame.
 """
 
@@ -78,8 +79,11 @@ class RideArrays(NamedTuple):
 
 @compiled_for_threads
 def command_rides(fleet: Arrays, rides: RideArrays, steers: FloatArray, frequency_hz: int) -> None:
-    """Begin a control step: set the steering actions `steers` (N,) of all cars, clipped to [-1, 1],
-    and add the effect of the wind to their speeds."""
+    """Begin a control step of all cars whose drives go on: set the steering actions, `steers` (N,)
+    clipped to [-1, 1], and add the effect of the wind over 1 / `frequency_hz` s to the velocities.
+
+    `fleet` has the arrays of the N cars (`Fleet.arrays`), `rides` the arrays of their drives.
+    """
     cars = fleet[0]
     for number in range(len(cars)):
         car = cars[number]
@@ -100,10 +104,11 @@ def command_rides(fleet: Arrays, rides: RideArrays, steers: FloatArray, frequenc
 def observe_rides(
     begin: int, end: int, fleet: Arrays, rides: RideArrays, steps: int
 ) -> tuple[int, int]:
-    """Observe those of the cars `begin` to `end` - 1 that have completed the `steps` physics steps
-    of their control step. Later calls skip a car whose drive is over (SKIPPED).
+    """Observe the cars `begin` to `end` - 1 after a control step of `steps` physics steps.
 
-    Returns the number of drives that go on, and the number of cars that did not complete the step.
+    A car that has not completed the step is not observed. A car whose drive is over is marked, and
+    later calls skip it. Returns the number of drives that go on, and the number of cars that did
+    not complete the step.
     """
     running, incomplete = 0, 0
     for number in range(begin, end):
@@ -122,7 +127,7 @@ def observe_rides(
 
 @compiled
 def note_state(number: int, fleet: Arrays, rides: RideArrays) -> bool:
-    """Write the true state of a car into the log; returns whether its drive goes on."""
+    """Write the true state of car `number` into `rides.log`; return whether its drive goes on."""
     car = fleet[0][number]
     road = fleet[6][int(car[ROAD])]
     table: Table = fleet[3][int(road[TABLE_BEGIN]) : int(road[TABLE_END])]
@@ -143,10 +148,11 @@ def note_state(number: int, fleet: Arrays, rides: RideArrays) -> bool:
 
 @compiled
 def observe_ride(number: int, step: int, car: FloatArray, rides: RideArrays) -> None:
-    """Fill the observation of car `number` at the control step `step`: the true road with the delay
-    of the perception, the car's present motion, and noise.
+    """Fill `rides.seen[number]` with the observation of `car`, row `number` of the fleet, at the
+    control step `step`.
 
-    Until the delay is over, the offset and the angle are 0, and the road is straight.
+    The road is observed with the delay of the perception, the car's motion without delay; noise is
+    added. Until the delay is over, the offset and the angle are 0, and the road is straight.
     """
     seen, track = rides.seen[number], car[TRACK_AT:]
     at = step - rides.delays[number]

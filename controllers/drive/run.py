@@ -55,14 +55,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Lane:
-    """The start of a drive and the line that it follows, m left of the track's centre."""
+    """The start of a drive and the centre of the lane to follow, both in m left of the track's
+    centre."""
 
     start_d: float
     centre: float
 
 
 class Observer(Protocol):
-    """A function that is called in each control step, before the car moves."""
+    """A function that is called in each control step, before the car moves, with the true state,
+    the perceived road and the steering action."""
 
     def __call__(self, now: CarState, perceived: Perceived, steer: float) -> None: ...
 
@@ -75,12 +77,13 @@ def drive(
     observers: Sequence[Observer] = (),
     parameters: Mapping[str, float] | None = None,
 ) -> DriveResult:
-    """Drive as `config` describes; `progress` and the `observers` are called in each step.
+    """Make the drive that `config` describes and return its result; `progress` and the `observers`
+    are called in each step.
 
-    `parameters` replace the controller's parameters in the file that `config` names. The log and
-    the film are written step by step, so an interrupted drive leaves the driven part. Raises
-    UserError for an unknown name, a lane or start outside the road, or a service that does not
-    answer.
+    `parameters`, if given, are used instead of the parameters in the file that `config` names. The
+    log and the film are written step by step, so an interrupted drive leaves the driven part.
+    Raises UserError for an unknown name, a lane or start outside the road, or a service that does
+    not answer.
     """
     check_light(config.light)  # a misspelt name is an error even without a camera
     if config.video is not None:
@@ -148,7 +151,8 @@ def _real_time(
 
 
 def check_started(config: DriveConfig, result: DriveResult) -> None:
-    """Raise UserError if the car did not leave its start."""
+    """Raise UserError if the car drove less than 5 m although its drive lasted 10 s or ended
+    early."""
     seconds = result.steps / FREQUENCY_HZ
     if result.distance_m >= START_M or (result.ended is None and seconds < START_S):
         return
@@ -180,9 +184,11 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """Add the latency and the losses of `config` to `perceive`; uncertain answers get less weight.
+    """Return `perceive` with the latency and the lost answers that `config` sets; answers with a
+    large standard deviation get less weight.
 
-    The state is predicted over the latency, but not over the further delay `unknown_s` (s).
+    The answers are late by another `unknown_s` s if this is above 0. The state is predicted over
+    the latency, but not over `unknown_s`.
     """
     late = partial(
         LatePerception,
@@ -273,11 +279,11 @@ def _recorder(
 
 
 def choose_lane(config: DriveConfig, road: Road) -> Lane:
-    """Return the start and the lane to follow.
+    """Return the start of the drive and the lane to follow.
 
-    Raises UserError for a lane or start outside the road. On perception it also raises UserError
-    for a target other than the lane of the start, because an image shows only the offset from the
-    lane that the car is in.
+    Raises UserError for a lane or start outside the road. If a model perceives the road, it also
+    raises UserError for a target lane other than the lane of the start, because an image shows only
+    the offset from the lane that the car is in.
     """
     target = config.target_lane
     if target is not None and not 0 <= target < road.lanes:
