@@ -59,10 +59,10 @@ Reward = Annotated[
 def options(
     config: type[Config],
 ) -> Callable[[Callable[[Config, bool], None]], Callable[..., None]]:
-    """Returns a decorator that turns a function `f(configuration, as_json)` into a Typer command.
+    """Return a decorator that turns a function `f(configuration, as_json)` into a Typer command.
 
     The options of the command are the annotated fields of the dataclass `config`, with their
-    defaults, and --json.
+    defaults, and --json, a flag whose value is `as_json`.
     """
     declared = [
         Parameter(

@@ -84,7 +84,8 @@ class Controller(Protocol):
     """A lateral controller. To add one, add a file to `laws` and an entry to `registry`."""
 
     def update(self, observation: Observation) -> float:
-        """The steering action in [-1, 1], left positive; called once for each control step."""
+        """Return the steering action in [-1, 1], left positive; called once for each control
+        step."""
 
 
 class BatchController(Controller, Protocol):
@@ -97,7 +98,7 @@ class BatchController(Controller, Protocol):
         return float(self.update_batch(Observations.of(observation))[0])
 
     def update_batch(self, observations: Observations) -> NDArray[np.float64]:
-        """The steering actions (N,) of all cars; called once for each control step.
+        """Return the steering actions (N,) of all cars; called once for each control step.
 
         The action of car k must equal the action that `update` of a separate controller for car k
         returns. A car whose drive is over keeps its last observation; its action is ignored.
