@@ -198,8 +198,7 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
 
 
 def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
-    """Group by controller the drives that `drive_many` can make; their controllers have
-    `update_batch`."""
+    """Group by controller the drives that `drive_many` can make, which needs `update_batch`."""
     groups: dict[str, list[Cell]] = {}
     for cell, (drive_config, _) in tasks.items():
         if can_join(drive_config):
