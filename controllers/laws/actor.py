@@ -29,7 +29,8 @@ Array = NDArray[np.float32]
 
 
 class ActorError(UserError):
-    """The files of an actor are missing, damaged, or made for another state or version."""
+    """The files of an actor are missing or damaged, or its state vector or version differs from
+    this program's."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ class ActorCard:
 class Actor:
     """A trained network: state, two hidden layers with ReLU, one output with tanh.
 
-    `weights` has the arrays called NAMES; the matrices are (inputs, outputs).
+    `weights` has w1 (size, h1), b1 (h1,), w2 (h1, h2), b2 (h2,), w3 (h2,) and b3 (1,), for states
+    of `size` numbers and hidden layers of h1 and h2 units.
     """
 
     def __init__(self, card: ActorCard, weights: dict[str, Array]) -> None:
@@ -82,7 +84,7 @@ class Actor:
         self._rows = 2 if card.odd else 1
 
     def steer(self, state: Array) -> float:
-        """The steering action in [-1, 1] for a state (size,)."""
+        """Return the action in [-1, 1], left positive, for a state (size,)."""
         of = self.weights
         hidden = (state @ self._w1).reshape(self._rows, -1)
         hidden = np.maximum(hidden + of["b1"], 0.0)
@@ -94,7 +96,8 @@ class Actor:
 
 
 def mirror_of(definition: StateDefinition) -> tuple[NDArray[np.intp], Array]:
-    """Order and signs that exchange left and right: the mirrored state is state[order] * signs."""
+    """Return the order and the signs, each (size,), that exchange left and right in a state: the
+    mirrored state is state[order] * signs."""
     return np.array(definition.order, np.intp), np.array(definition.odd, np.float32)
 
 
@@ -112,8 +115,8 @@ def is_actor(folder: Path) -> bool:
 def load_actor(folder: Path) -> Actor:
     """Load the actor in `folder`.
 
-    Raises ActorError for missing or damaged files, and for an actor of another state or version,
-    which would steer the car off the road.
+    Raises ActorError for missing or damaged files, and for an actor whose state vector or version
+    differs from this program's, because it would steer the car off the road.
     """
     card = _read_card(folder / CARD)
     path = folder / WEIGHTS

@@ -1,18 +1,19 @@
 """The state vector that an actor receives. Training and driving use the same four definitions:
 
-- `paper` has the paper's seven numbers (`trackfeatures.state_vector`).
-- `stacked` has d/w (offset over half the width of the track), angle/pi, v_x and v_y over 75 km/h,
-  the class of the road as a number (left 1, straight 0, right -1), the yaw rate (rad/s), the
-  changes of d/w and angle/pi since the last step, and the last two steering actions. The curvature
-  of the road can be inferred from them, but not from `paper`. LQR also receives the yaw rate.
+- `paper` has the paper's seven numbers (`trackfeatures.state_vector`): d/w (offset over half the
+  width of the track), angle/pi, v_x and v_y over 75 km/h, and the class of the road, one-hot.
+- `stacked` has the first four numbers of `paper`, the class of the road as one number (left 1,
+  straight 0, right -1), the yaw rate (rad/s), the changes of d/w and angle/pi since the last step,
+  and the last two steering actions. The curvature of the road can be inferred from `stacked`, but
+  not from `paper`. LQR also receives the yaw rate.
 - `residual` has the numbers of `stacked` and the steering of the controller `lqr`. The car is
   steered by that steering plus 0.3 times the actor's action (residual reinforcement learning,
   Johannink et al. 2019).
 - `history` has the paper's state of the present step, and the differences between the states of
   the seven steps before and the present state. Noise, delay and the car's motion can be inferred.
 
-Every drive divides the lateral offset by half the width of the track of the training, because a
-controller does not know the width of the road, and its gains are per metre.
+Every drive divides the lateral offset by half the width of the track of the training. A controller
+does not know the width of the road, and the actor was trained for offsets in this unit.
 """
 
 from collections import deque
@@ -36,7 +37,8 @@ needs a steering action of about 0.3."""
 
 @dataclass(frozen=True)
 class StateDefinition:
-    """Names, spreads and symmetry of the numbers of a state."""
+    """The numbers of a state: their names, their typical sizes, and how they change when left and
+    right are exchanged."""
 
     name: str
     parts: tuple[str, ...]
@@ -107,8 +109,11 @@ def find_state(name: str) -> StateDefinition:
 
 
 def paper_state(seen: Observation, half_width: float) -> Vector:
-    """Return the paper's state (7,) of an observation. `half_width` is half the width (m) of the
-    track of the training."""
+    """Return the paper's state (7,) of an observation: d/w, angle/pi, v_x and v_y over 75 km/h, and
+    the class of the road, one-hot.
+
+    `half_width` is w, half the width (m) of the track of the training.
+    """
     return state_vector(
         *(seen.to_lane_centre, seen.angle, seen.vx, seen.vy, seen.heading), half_width=half_width
     ).astype(np.float32)
@@ -142,7 +147,7 @@ class StateBuilder:
         self._steers = (0.0, 0.0)
 
     def build(self, paper: Vector, observation: Observation) -> Vector:
-        """The state from the paper's state (7,) and the observation of the same step."""
+        """Return the state (size,) of a step from its paper's state (7,) and its observation."""
         if self._plain:
             return paper
         if self._recent is not None:
@@ -162,7 +167,8 @@ class StateBuilder:
         return np.array(numbers, np.float32)
 
     def steer(self, action: float) -> float:
-        """The steering in [-1, 1] for the actor's action in the state that was built last."""
+        """Return the steering in [-1, 1] for the actor's action in the state that `build` returned
+        last."""
         if self._lqr is not None:
             action = min(max(self._lqr_steer + RESIDUAL_REACH * action, -1.0), 1.0)
         self._steers = (action, self._steers[0])

@@ -50,10 +50,10 @@ DELAY_MEMORY = np.dtype(
 
 
 def first_delays(cars: int, dt: float, known_s: float | None = None) -> NDArray[Any]:
-    """Return the initial memory (N,) of N = `cars` cars, of the type DELAY_MEMORY.
+    """Return the initial delay estimates (N,) of N = `cars` cars, of the type DELAY_MEMORY.
 
     `known_s`: the delay in s, which is then not estimated; None if it is unknown. Raises UserError
-    for a delay of more than `MAX_DELAY` steps of `dt` s.
+    for a delay below 0 or of more than 4 steps of `dt` s.
     """
     memory = np.zeros(cars, DELAY_MEMORY)
     if known_s is not None:
@@ -69,9 +69,10 @@ def first_delays(cars: int, dt: float, known_s: float | None = None) -> NDArray[
 
 @compiled
 def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
-    """Update the estimate by a control step of `dt` s; returns whether the delay `memory.steps`
-    changed.
+    """Update the delay estimate of one car by a control step of `dt` s; return whether the
+    estimated delay changed.
 
+    `memory` is an element of the result of `first_delays`, and `memory.steps` the estimated delay.
     `theta` is the perceived heading error (rad), `yaw_rate` the present yaw rate (rad/s).
     """
     if memory.is_given:
@@ -104,8 +105,13 @@ def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
 
 @compiled
 def decide(memory: Any, compared: Vector, span: int) -> None:
-    """Change `memory.steps` to the delay with the smallest mean of the squared residuals `compared`
-    (n, delays), if the means differ by more than `SURE` standard errors. Update `is_known`, too."""
+    """Change the estimated delay `memory.steps` if another delay explains the measurements better.
+
+    `compared` (n, 5) has the squared residuals of n steps for delays of 0 to 4 steps. The best
+    delay has the smallest mean. It becomes the estimate if this mean is smaller than the mean of
+    the present estimate by 3.5 standard errors. `memory.is_known` is set if the estimate changes,
+    or is better than all other delays by this margin. `span`: control steps of a second difference.
+    """
     n, best = len(compared), 0
     sums = np.zeros(MAX_DELAY + 1)
     for row in range(n):

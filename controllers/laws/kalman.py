@@ -85,12 +85,13 @@ class StateEstimate:
 
     @property
     def speeds(self) -> Vector:
-        """vx (N,) in m/s of the last control step."""
+        """Forward speeds vx (N,) of the cars in the last control step, m/s."""
         speeds: Vector = self.memory["last"][:, SPEED]
         return speeds
 
     def update(self, observations: Observations, wheel_angles: Vector) -> Vector:
-        """Return the present states (N, 5) after the observations of this control step.
+        """Return the present states (N, 5), e, theta, vy, r and kappa, after the observations of
+        this control step.
 
         `wheel_angles` (N,): angles (rad) of the front wheels since the last control step. A
         measurement that is not finite is replaced by the last finite one, because otherwise it
@@ -108,8 +109,12 @@ class StateEstimate:
 def estimate_states(
     seen: Vector, wheel_angles: Vector, memory: Any, delays: Any, table: Vector, dt: float
 ) -> Vector:
-    """Compiled `StateEstimate.update`: returns the states (N, 5) for the rows of `Observations`
-    `seen` (N, OBSERVED). The memories (N,) `memory` and `delays` are updated in place."""
+    """Return the present states (N, 5) of N cars after their observations `seen` (N, 7), the rows
+    of `Observations`.
+
+    `memory` (N,) of the type STATE_MEMORY and `delays` (N,) of the type DELAY_MEMORY are updated in
+    place. `wheel_angles` (N,) is in rad. `table` is the result of `transitions(dt)`.
+    """
     states = np.empty((len(seen), STATES))
     for k in range(len(seen)):
         states[k] = estimate_state(seen[k], wheel_angles[k], memory[k], delays[k], table, dt)
@@ -120,8 +125,11 @@ def estimate_states(
 def estimate_state(
     seen: Vector, wheel_angle: float, memory: Any, delay: Any, table: Vector, dt: float
 ) -> Vector:
-    """Return the present state (5,) of one car after its observation `seen` (OBSERVED,). `memory`
-    and `delay` are updated in place."""
+    """Return the present state (5,) of one car after its observation `seen` (7,).
+
+    `memory` (a STATE_MEMORY) and `delay` (a DELAY_MEMORY) of the car are updated in place.
+    `wheel_angle` is in rad. `table` is the result of `transitions(dt)`.
+    """
     own, x, last = memory.own, memory.x, memory.last
     note_finite(0, seen[TO_LANE_CENTRE], last)
     note_finite(1, -seen[ANGLE], last)
@@ -163,8 +171,12 @@ def note_finite(place: int, value: float, last: Vector) -> None:
 
 @compiled
 def note_noise(measured: Vector, memory: Any) -> None:
-    """Update `memory.noise_variance` (4,) from the third differences over time of the measured
-    offset (m), heading error (rad), lateral velocity (m/s) and yaw rate (rad/s)."""
+    """Update the estimated variances of the noise, `memory.noise_variance` (4,), from the third
+    differences over time of the measurements.
+
+    `measured` (4,): offset (m), heading error (rad), lateral speed (m/s) and yaw rate (rad/s).
+    `memory` is the STATE_MEMORY of one car.
+    """
     recent, variance = memory.recent, memory.noise_variance
     for k in range(MEASURED):
         for row in range(len(recent) - 1, 0, -1):
@@ -180,7 +192,7 @@ def note_noise(measured: Vector, memory: Any) -> None:
 
 @lru_cache(maxsize=8)
 def transitions(dt: float) -> Vector:
-    """Return the exact transition matrices over `dt` s, (speeds, 5, 6), for the speeds of the grid.
+    """Return the exact transition matrices (22, 5, 6) over `dt` s for vx = 3, 5, ..., 45 m/s.
 
     A matrix times the state (5) and the wheel angle (rad) is the next state.
     """
@@ -212,12 +224,13 @@ def advance(
     process: Vector,
     delay: int,
 ) -> Vector:
-    """One control step of the filter; returns the present state (5,).
+    """Advance the filter of one car by one control step; return the present state (5,).
 
     `x` (5,) and `covariance` (5, 5) are the state at the moment of the image, `delay` steps ago;
-    both are updated in place. `table`: the result of `transitions`. `own` (n, 4): vx, vy, yaw rate
-    and wheel angle, newest first. The first two elements of `seen` are e and theta of the image.
-    `variance` (4,): variances of the measurements. `process` (5,): variances of the model's error.
+    both are updated in place. `table`: the result of `transitions`. `own` (6, 4): vx, vy (m/s), yaw
+    rate (rad/s) and wheel angle (rad) of the last steps, newest first. The first two elements of
+    `seen` are e and theta of the image. `variance` (4,): variances of the measurements. `process`
+    (5,): variances of the model's error per step.
     """
     predict(x, covariance, table, own[delay + 1, 0], own[delay + 1, 3], process)
     correct(x, covariance, V, own[delay, 1], variance[V])
@@ -238,7 +251,8 @@ def predict(
 ) -> None:
     """Replace state `x` (5,) and covariance (5, 5) by their predictions for the next control step.
 
-    `vx` (m/s) and `wheel` (rad) are the speed and the wheel angle during the step.
+    `vx` (m/s) and `wheel` (rad) are the speed and the wheel angle during the step. `table` is the
+    result of `transitions`. `process` (5,): variances of the model's error per step.
     """
     place = (min(max(vx, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
     low = min(int(place), len(table) - 2)

@@ -54,7 +54,8 @@ MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 def make_lqr_kalman(
     loop: LoopConfig, *, wheel_rate: float = WHEEL_RATE, **weights: float
 ) -> "LqrKalman":
-    """Make an `LqrKalman` for a control loop; `weights` replace fields of its `LqrWeights`."""
+    """Make an `LqrKalman` for a control loop. `wheel_rate` is the weight of the squared change of
+    the wheel angle in a control step; `weights` replace fields of its `LqrWeights`."""
     return LqrKalman(loop.dt, replace(WEIGHTS, **weights), wheel_rate, loop.delay_s)
 
 
@@ -132,9 +133,14 @@ def regulate_smoothly(
     cautious: Matrix,
     steady_bends: Matrix,
 ) -> Matrix:
-    """Return the steering actions (N,) of `LqrKalman` for cars at `speeds` (N,) with estimated
-    `states` (N, 5) and `delays` (N,). `wheel_angles` (N,) is updated in place. The last three
-    arguments are results of `speed_table`."""
+    """Return the steering actions (N,) of `LqrKalman`; `wheel_angles` (N,), rad, are updated in
+    place.
+
+    `speeds` (N,) are in m/s, `states` (N, 5) the estimated states, `delays` (N,) of the type
+    DELAY_MEMORY. The tables over the speed are made by `speed_table`: `gains` and `cautious` (22,
+    5) have the gains for a known and an unknown delay, `steady_bends` (22, 2) the results of
+    `LateralModel.cornering`.
+    """
     steers = np.empty(len(states))
     for k in range(len(states)):
         offset, theta, curvature = states[k, E], states[k, THETA], states[k, KAPPA]

@@ -59,7 +59,8 @@ class LateralModel:
         return step[:4, :4], step[:4, 4:]
 
     def cornering(self, speed: float) -> tuple[float, float]:
-        """Return wheel angle and e2 over the road's curvature, rad m, in a steady bend with e1 = 0.
+        """Return the wheel angle per curvature and e2 per curvature (both rad m) in a steady bend
+        with e1 = 0, at `speed` m/s.
 
         e2 is not zero in a bend: the car's heading differs from its path by the slip angle.
         """

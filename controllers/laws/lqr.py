@@ -11,16 +11,16 @@ preview of the road. Deviations from the paper:
 - One set of weights serves all tracks, with a softer set for a perceived state; the paper tunes
   five numbers for each track.
 
-On perception `Lqr` and `LqrPreview` limit the heading error at which they return to the line to
-0.15 rad. Without the limit a start at rest 2.7 m beside the line (TORCS's place on the grid of
-eroad) turns the car by 0.6 rad; the shipped model answers 0.25 rad at most, and the car left the
+On a perceived state, `Lqr` and `LqrPreview` limit the heading error at which they return to the
+line to 0.15 rad. Without the limit a start at rest 2.7 m beside the line (TORCS's starting position
+on eroad) turns the car by 0.6 rad; the shipped model answers 0.25 rad at most, and the car left the
 road.
 
 `LqrPreview` (`lqr-preview`) adds a feed-forward of the curvature just ahead: a wheel angle, and the
-slip angle of a steady bend as the set point. On perception the curvature is estimated from the yaw
-rate (low-pass filter, sign limited by the class of the road), which removes the steady offset in
-bends. With the errors of a briefly trained network (0.25 m, 0.025 rad) the car strays 1.1 m from
-the centre of `town` with the paper's weights, and 0.6 m with the softer weights.
+slip angle of a steady bend as the set point. If the curvature is not measured, it is estimated from
+the yaw rate (low-pass filter, sign limited by the class of the road), which removes the steady
+offset in bends. With the errors of a briefly trained network (0.25 m, 0.025 rad) the car strays
+1.1 m from the centre of `town` with the paper's weights, and 0.6 m with the softer weights.
 
 `LqrPaper` (`lqr-paper`) computes what the paper's released code computes: the continuous gains, and
 steer = -K x / 21. The regulator's angle is in rad but 21 is the lock in degrees, so the car steers
@@ -101,8 +101,8 @@ def make_lqr_paper(loop: LoopConfig, **weights: float) -> "LqrPaper":
 
 
 def approach_limit(loop: LoopConfig) -> float:
-    """Return the largest heading error (rad) with which the car drives back to the line; unlimited
-    for the exact state."""
+    """Return the largest heading error (rad) at which a regulator drives the car back to the line:
+    0.15 on a perceived state, and no limit (1e6) on the exact state."""
     return APPROACH_RAD if loop.noisy else UNLIMITED_RAD
 
 
@@ -186,8 +186,12 @@ class LqrPaper(BatchController):
 def regulate(
     seen: Matrix, gains: Matrix, rates: Matrix, dt: float, blend: float, approach_rad: float
 ) -> Matrix:
-    """Return the steering actions (N,) of `Lqr`. `rates` (N, RATE), the memory of the rate of the
-    heading error, is updated in place."""
+    """Return the steering actions (N,) of `Lqr` for `seen` (N, 7), the rows of `Observations`.
+
+    `gains` (22, 4) is the result of `discrete_gains`. `rates` (N, 3) has the memory of `next_rate`
+    for each car's heading error and is updated in place; `blend` is the weight of its filter.
+    `approach_rad` limits the heading error (rad) at which the car returns to the line.
+    """
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         vx, theta = seen[k, VX], -seen[k, ANGLE]
@@ -215,8 +219,14 @@ def regulate_with_preview(
     filter_s: float,
     approach_rad: float,
 ) -> Matrix:
-    """Return the steering actions (N,) of `LqrPreview`. `curvatures` (N,), the estimates (1/m) for
-    cars without a measured curvature, is updated in place."""
+    """Return the steering actions (N,) of `LqrPreview` for `seen` (N, 7), the rows of
+    `Observations`.
+
+    `gains` (22, 4) and `steady_bends` (22, 2) are tables of `discrete_gains` and
+    `LateralModel.cornering` over the speed. `curvatures` (N,), the estimates (1/m) for cars without
+    a measured curvature, are updated in place and filtered with the time constant `filter_s` (s).
+    `approach_rad` limits the heading error (rad) at which the car returns to the line.
+    """
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         vx, theta, yaw_rate = seen[k, VX], -seen[k, ANGLE], seen[k, YAW_RATE]
@@ -240,8 +250,11 @@ def regulate_with_preview(
 
 @compiled_for_threads
 def regulate_as_released(seen: Matrix, gains: Matrix, rates: Matrix, dt: float) -> Matrix:
-    """Return the steering actions (N,) of `LqrPaper`. `rates` (N, 2, RATE), the memory of the rates
-    of offset and heading error, is updated in place."""
+    """Return the steering actions (N,) of `LqrPaper` for `seen` (N, 7), the rows of `Observations`.
+
+    `gains` (22, 4) is the result of `continuous_gains`. `rates` (N, 2, 3), the memories of
+    `next_rate` for offset and heading error, are updated in place.
+    """
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         offset, theta = seen[k, TO_LANE_CENTRE], -seen[k, ANGLE]
@@ -268,7 +281,8 @@ def next_rate(memory: Matrix, value: float, dt: float, blend: float) -> float:
     """Return the rate of change of `value`, its difference over a control step of `dt` s, low-pass
     filtered with the weight `blend`.
 
-    The rate of the first value is 0. `memory` (RATE,) is updated in place.
+    The rate of the first value is 0. `memory` (3,), which is updated in place, has 1 after the
+    first value (else 0), the last value, and the rate.
     """
     if memory[0] != 0.0:
         memory[2] += blend * ((value - memory[1]) / dt - memory[2])

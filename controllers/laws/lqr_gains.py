@@ -35,9 +35,10 @@ class LqrWeights:
 
 
 def dlqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
-    """Gain K (inputs, states) of u = -K x for x[k+1] = A x[k] + B u[k].
+    """Return the gain K (inputs, states) of the law u = -K x for x[k+1] = A x[k] + B u[k].
 
-    The cost is sum(x^T Q x + u^T R u).
+    K minimises sum(x^T Q x + u^T R u). A and Q are (states, states), B (states, inputs), R (inputs,
+    inputs).
     """
     P = solve_discrete_are(A, B, Q, R)
     gain: Matrix = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
@@ -45,9 +46,10 @@ def dlqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
 
 
 def clqr(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
-    """Gain K (inputs, states) of u = -K x for dx/dt = A x + B u.
+    """Return the gain K (inputs, states) of the law u = -K x for dx/dt = A x + B u.
 
-    The cost is integral(x^T Q x + u^T R u).
+    K minimises integral(x^T Q x + u^T R u). A and Q are (states, states), B (states, inputs), R
+    (inputs, inputs).
     """
     P = solve_continuous_are(A, B, Q, R)
     gain: Matrix = np.linalg.solve(R, B.T @ P)
@@ -63,16 +65,19 @@ def discrete_gain(model: LateralModel, weights: LqrWeights, speed: float, dt: fl
 
 
 def speed_table(compute: Callable[[float], Matrix | tuple[float, ...]]) -> Matrix:
-    """Return the results (speeds, n) of `compute` for the speeds (m/s) of the grid. `row_at` reads
-    them."""
+    """Return the results of `compute`, n numbers each, for the speeds 3, 5, ..., 45 m/s: an array
+    (22, n), from which `row_at` interpolates."""
     speeds = np.arange(SLOWEST_M_S, FASTEST_M_S + GRID_M_S, GRID_M_S)
     return np.array([compute(float(speed)) for speed in speeds])
 
 
 @compiled
 def row_at(rows: Matrix, speed: float) -> Matrix:
-    """Return the row (n,) for `speed` m/s of `rows` (speeds, n), a result of `speed_table`. It is
-    interpolated linearly in the grid, and constant outside."""
+    """Interpolate `rows` (22, n), a result of `speed_table`, linearly at `speed` m/s; return the
+    row (n,).
+
+    The first row also applies below 3 m/s, the last row above 45 m/s.
+    """
     place = (min(max(speed, SLOWEST_M_S), FASTEST_M_S) - SLOWEST_M_S) / GRID_M_S
     low = min(int(place), len(rows) - 2)
     share = place - low
@@ -82,7 +87,8 @@ def row_at(rows: Matrix, speed: float) -> Matrix:
 
 @lru_cache(maxsize=64)
 def discrete_gains(weights: LqrWeights, dt: float) -> Matrix:
-    """Gains (speeds, 4) of the discrete regulator for the paper's car, for `row_at`.
+    """Return the gains (22, 4) of the discrete regulator for the paper's car, a result of
+    `speed_table`.
 
     `dt` is the control step (s). The result is cached, because a command can make many equal
     controllers.
@@ -92,7 +98,8 @@ def discrete_gains(weights: LqrWeights, dt: float) -> Matrix:
 
 @lru_cache(maxsize=64)
 def continuous_gains(weights: LqrWeights) -> Matrix:
-    """Gains (speeds, 4) of the continuous regulator for the paper's car, for `row_at`."""
+    """Return the gains (22, 4) of the continuous regulator for the paper's car, a result of
+    `speed_table`."""
 
     def gain(speed: float) -> Matrix:
         A, B, _ = LateralModel().matrices(speed)

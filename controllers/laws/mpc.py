@@ -1,7 +1,8 @@
 """Nonlinear model predictive control: the paper's second controller.
 
-Kinematic single-track model (Kong et al. 2015, "Kinematic and dynamic vehicle models for autonomous
-driving control design"), Euler steps of 50 ms, over a horizon of `HORIZON` steps:
+The model is the kinematic single-track model (Kong et al. 2015, "Kinematic and dynamic vehicle
+models for autonomous driving control design"), in Euler steps of a control step (50 ms), over a
+horizon of 10 steps:
 
     y' = v sin(psi + beta), psi' = v cos(beta) / (lf + lr) tan(delta)
     beta = atan(lr / (lf + lr) tan(delta)), |delta| <= the steering lock
@@ -77,7 +78,8 @@ def make_mpc(loop: LoopConfig, **weights: float) -> "Mpc":
 
 
 def make_mpc_preview(loop: LoopConfig, **weights: float) -> "Mpc":
-    """Make an `Mpc` whose reference follows the curvature of the road just ahead."""
+    """Make an `Mpc` whose reference follows the curvature of the road just ahead; `weights` replace
+    fields of its `MpcWeights`."""
     return Mpc(loop.dt, replace(_weights(loop), **weights), preview=True)
 
 
@@ -115,11 +117,12 @@ class Mpc(BatchController):
 def plan_cars(
     seen: Vector, plans: Vector, curvatures: Vector, preview: bool, dt: float, cost: Vector
 ) -> Vector:
-    """Return the steering actions (N,) for `seen`, the rows of `Observations` (N, OBSERVED).
+    """Return the steering actions (N,) for `seen` (N, 7), the rows of `Observations`.
 
-    The `plans` (N, n) of the last step are replaced by the new plans. With `preview` the reference
-    has the measured curvature of the road, or, where it is not measured, the estimate in
-    `curvatures` (N,), which is updated in place. Without `preview` its curvature is 0.
+    `plans` (N, n), the front wheel angles (rad) that were planned in the last step, are replaced by
+    the new plans. With `preview` the reference has the measured curvature of the road, or, where it
+    is not measured, the estimate in `curvatures` (N,), 1/m, which is updated in place. Without
+    `preview` the reference is straight. `cost` (3,): weights of offset, heading and wheel angle.
     """
     steers = np.empty(len(seen))
     for k in range(len(seen)):
@@ -140,8 +143,10 @@ def plan_cars(
 
 @compiled
 def roll_out(plan: Vector, speed: float, dt: float, states: Vector) -> None:
-    """Fill `states` (n + 1, 2), y (m) and psi (rad): its first row is the start, the others follow
-    from the wheel angles `plan` (n,) at `speed` m/s and steps of `dt` s."""
+    """Fill the rows 1 to n of `states` (n + 1, 2), y (m) and psi (rad), from row 0, the start.
+
+    `plan` (n,) has the wheel angles (rad) of the steps of `dt` s; `speed` (m/s) is constant.
+    """
     for k in range(len(plan)):
         slope = math.tan(plan[k])
         slip = math.atan(REAR_AXLE_M / WHEELBASE_M * slope)
@@ -153,8 +158,11 @@ def roll_out(plan: Vector, speed: float, dt: float, states: Vector) -> None:
 def plan_cost(
     plan: Vector, states: Vector, speed: float, dt: float, curvature: float, cost: Vector
 ) -> float:
-    """Return the cost of `plan` (n,), which leads to `states` (n + 1, 2); `cost` (3,) has the
-    weights and `curvature` (1/m) belongs to the reference."""
+    """Return the cost of `plan` (n,), the wheel angles (rad) that lead to `states` (n + 1, 2).
+
+    `curvature` (1/m) is the reference's; `cost` (3,) has the weights of offset, heading and wheel
+    angle.
+    """
     total = 0.0
     for k in range(len(plan)):
         turned = curvature * speed * dt * (k + 1)
@@ -174,8 +182,13 @@ def backward_pass(
     cost: Vector,
     steps: Vector,
 ) -> None:
-    """Fill `steps` (n, 3) from the last step to the first: the change of each wheel angle, within
-    the lock, and its feedback gains on the changes of y and psi."""
+    """Fill `steps` (n, 3), from the last step of `plan` to the first, with the improvement of each
+    step.
+
+    A row has the change of the wheel angle (rad), limited so that the angle stays within the
+    steering lock, and the feedback gains of the wheel angle on changes of y and psi. `plan`,
+    `states`, `curvature` and `cost` are the arguments of `plan_cost`.
+    """
     n = len(plan)
     share = REAR_AXLE_M / WHEELBASE_M
     gy = gp = hyy = hyp = hpp = 0.0  # gradient and Hessian of the cost to go

@@ -54,10 +54,10 @@ def load_controller(folder: Path, loop: LoopConfig = EXACT) -> RlController:
 
 
 def make_rl(loop: LoopConfig) -> RlController:
-    """Load the shipped actor of the paper's state. Raises UserError unless `loop.dt` is STEP_S."""
+    """Load the shipped actor of the paper's state. Raises UserError unless `loop.dt` is 0.05 s."""
     return load_controller(SHIPPED / "rl", loop)
 
 
 def make_rl_residual(loop: LoopConfig) -> RlController:
-    """Load the shipped actor that corrects LQR. Raises UserError unless `loop.dt` is STEP_S."""
+    """Load the shipped actor that corrects LQR. Raises UserError unless `loop.dt` is 0.05 s."""
     return load_controller(SHIPPED / "rl-residual", loop)

@@ -38,8 +38,8 @@ AllowedSpeed = Callable[[CarState, Perceived], float]
 class SpeedHold:
     """Pedals that hold `speed` m/s; called once for each control step of `dt` s.
 
-    `slope` returns the slope of the road (rise over run). Raises UserError for a speed out of
-    range.
+    `allowed` returns the speed (m/s) that the road allows, `slope` the slope of the road (rise over
+    run). Raises UserError for a `speed` outside 1 to 40 m/s.
     """
 
     def __init__(
@@ -73,7 +73,9 @@ class SpeedHold:
 
     @property
     def mean_error(self) -> float | None:
-        """Mean absolute speed error (m/s) on free straights; None without free straights."""
+        """Mean absolute speed error (m/s) while neither a bend nor traffic limited the speed,
+        without the time that the car needs to reach the set speed; None if there was no such
+        time."""
         return sum(self._errors) / len(self._errors) if self._errors else None
 
 

@@ -35,7 +35,8 @@ def make_torcs(loop: LoopConfig) -> "StateFeedback":
 
 
 class StateFeedback(BatchController):
-    """Steers by constant gains on offset, its rate, heading error and yaw rate (see the module)."""
+    """Steers by constant gains on the offset, its rate of change, the heading error and the yaw
+    rate."""
 
     def update_batch(self, observations: Observations) -> Matrix:
         return feed_back(observations.rows)
@@ -43,7 +44,7 @@ class StateFeedback(BatchController):
 
 @compiled_for_threads
 def feed_back(seen: Matrix) -> Matrix:
-    """Return the steering actions (N,) for `seen`, the rows of `Observations` (N, OBSERVED)."""
+    """Return the steering actions (N,) for `seen` (N, 7), the rows of `Observations`."""
     steers = np.empty(len(seen))
     for k in range(len(seen)):
         theta = -seen[k, ANGLE]
