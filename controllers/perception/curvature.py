@@ -15,11 +15,12 @@ LEFT, RIGHT = int(RoadClass.LEFT), int(RoadClass.RIGHT)
 def next_curvature(
     value: float, yaw_rate: float, vx: float, heading: float, dt: float, filter_s: float
 ) -> float:
-    """Return the estimate (1/m, left positive) after a control step, from the estimate `value`
-    before it.
+    """Return the estimated curvature of the road (1/m, left positive) after a control step of `dt`
+    s.
 
-    It is the yaw rate over the speed, low-pass filtered with the time constant `filter_s` (s). It
-    is not negative where the class of the road, `heading`, is left, and not positive where right.
+    `value` is the estimate before the step. The estimate is `yaw_rate` (rad/s) over `vx` (m/s, at
+    least 3), low-pass filtered with the time constant `filter_s` (s). It is not negative where the
+    class of the road, `heading`, is left, and not positive where the class is right.
     """
     turning = yaw_rate / max(vx, SLOWEST_M_S)
     value += dt / (dt + filter_s) * (turning - value)

@@ -41,7 +41,10 @@ class _Moment:
 
 
 class StatePredictor:
-    """Predicts an answer from the moment of its image to the present, over at most `longest_s`."""
+    """Predicts an answer from the moment of its image to the present, over at most `longest_s` s.
+
+    Call `add` once for each control step of `dt` s.
+    """
 
     def __init__(self, dt: float, longest_s: float) -> None:
         self._dt = dt
@@ -54,8 +57,8 @@ class StatePredictor:
         self._moments.append(_Moment(now.vx, now.vy, now.yaw_rate, self._curvature(seen)))
 
     def predict(self, answer: Perceived, age: int, until: int = 0) -> Perceived:
-        """Return `answer`, whose image is `age` control steps old, predicted from the moment of the
-        image to the moment `until` steps ago."""
+        """Return `answer` predicted from the moment of its image, `age` control steps ago, to the
+        moment `until` control steps ago."""
         if age == until or answer.to_lane_centre is None:
             return answer
         moments = list(self._moments)
@@ -73,7 +76,8 @@ class StatePredictor:
 
 
 class RoadEstimate:
-    """The estimate of the road: received answers are fused by `Trust` and predicted to the present.
+    """Estimates the road from late and lost answers: `Trust` fuses the received answers, and the
+    result is predicted to the present.
 
     Call `update` once for each control step, then `present`. With `predict=False` the estimate is
     the newest answer, unchanged.
@@ -89,7 +93,8 @@ class RoadEstimate:
         self._heading = RoadClass.STRAIGHT
 
     def update(self, now: CarState, arrived: Perceived | None, age: int) -> None:
-        """Advance by one control step; `arrived` answers the image of `age` control steps ago."""
+        """Advance by one control step. `arrived` is the answer to the image of `age` control steps
+        ago; None if no answer arrived in this step."""
         self._age += 1
         if arrived is not None:
             self._heading = arrived.heading
@@ -107,8 +112,11 @@ class RoadEstimate:
         return self._trust.correct(known, arrived, steps, steps * self.dt * speed)
 
     def present(self, due: int) -> Perceived:
-        """Return the estimate of the road at this control step. An answer is due `due` steps after
-        its image; `lost_s` is the time for which answers have been overdue or untrusted."""
+        """Return the estimate of the road at this control step.
+
+        An answer is due `due` steps after its image. `lost_s` of the result is the time (s) for
+        which no answer arrived when it was due, or the answers had little weight in the estimate.
+        """
         waited_s = max(self._age - due, 0) * self.dt
         if self._last is None or waited_s > LOST_S:
             return Perceived(None, 0.0, self._heading, None, lost_s=waited_s)
@@ -150,7 +158,7 @@ def check_drop(drop: float) -> None:
 
 def delay_steps(latency_s: float, dt: float) -> int:
     """Return a latency in control steps of `dt` s, rounded up. Raises UserError for a latency below
-    0 or above LOST_S."""
+    0 or above 1 s."""
     if not 0.0 <= latency_s <= LOST_S:
         raise UserError(f"a latency of {1000 * latency_s:g} ms; give 0 to 1000 ms")
     return math.ceil(latency_s / dt - 1e-9)
@@ -160,8 +168,8 @@ class LatePerception(Generic[World]):
     """A perception whose answers arrive `latency_s` late; a share `drop` of them is lost.
 
     The latency is rounded up to control steps, because a controller uses an answer at its next
-    step. `predict=False` returns the late answers without prediction. Raises UserError for values
-    out of range.
+    step. `predict=False` returns the late answers without prediction. Raises UserError for a
+    latency outside 0 to 1 s, and for a share below 0 or not below 1.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class AnswerSource(Protocol[Request, Answer]):
         """Request the answer to the frame of a control step, without waiting."""
 
     def take(self) -> list[TimedAnswer[Answer]]:
-        """The answers received since the last call, oldest first."""
+        """Return the answers received since the last call, oldest first."""
 
     def close(self) -> None:
         """End the source's thread, if it has one."""
@@ -224,9 +224,10 @@ class RealTimePerception(Generic[World, Frame, Answer]):
 def real_time(
     perceive: Perceive, *, dt: float, drop: float, rng: np.random.Generator
 ) -> RealTimePerception["SimulatedWorld", Any, Any]:
-    """Return `perceive` in real time. A share `drop` of the answers, random by `rng`, is lost.
+    """Return a perception that asks `perceive` in real time, once for each control step of `dt` s.
 
-    Only a perception with a camera takes time to answer. Raises UserError for `drop` out of range.
+    A share `drop` of the answers, random by `rng`, is lost. Only a perception with a camera takes
+    time to answer. Raises UserError unless `drop` is at least 0 and below 1.
     """
     check_drop(drop)
 

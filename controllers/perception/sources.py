@@ -33,7 +33,8 @@ class FeatureModel(Protocol):
     camera: CameraParameters
 
     def predict(self, image: Image) -> dict[str, Any]:
-        """Return the prediction for an RGB image (H, W, 3), in the format of a service's answer."""
+        """Return the prediction for an RGB image (H, W, 3), with the members of a service's answer
+        to POST /features."""
 
     def close(self) -> None:
         """Close the model's connection, if it has one."""
@@ -99,7 +100,9 @@ class ServiceModel:
 
 
 def parse_camera(content: Any) -> CameraParameters:
-    """Read the camera in a service's model card. Raises UserError if a value is missing."""
+    """Read the camera in a service's model card, a dictionary with the sides in px, the position in
+    m, and the field of view and pitch in deg. Raises UserError if a value is missing or no
+    number."""
     try:
         return CameraParameters(
             width=int(content["width"]),
@@ -138,7 +141,8 @@ class CameraPerception:
         return image
 
     def ask(self, image: Image) -> dict[str, Any]:
-        """Return the model's answer to `image`. Call it in any thread, but not in two at once."""
+        """Return the model's answer to `image` (H, W, 3) RGB, with the members of a service's
+        answer. Call it in any thread, but not in two threads at once."""
         return self._model.predict(image)
 
     def read(self, answer: dict[str, Any]) -> Perceived:
@@ -182,7 +186,8 @@ def _require_finite(*values: float) -> None:
 
 
 def check_perception(name: str, model: str) -> None:
-    """Raise UserError for an unknown perception `name`, or a missing run `model`."""
+    """Raise UserError for an unknown perception `name`, or if `name` is "model" and there is no run
+    `model`."""
     if name == "model":
         from mtlnet.inference.model_card import resolve_run
 
@@ -200,9 +205,9 @@ def open_perception(
 ) -> Iterator[Perceive]:
     """Open the perception `name`: "truth", "model" (the run `model`), or a service's address.
 
-    `lane_centre` (m, left positive) is the centre of the lane to follow; `light` and `seed` set the
-    scene of the images. Raises UserError for another name, a missing model, or a service that does
-    not answer.
+    `lane_centre` (m, left positive) is the centre of the lane to follow. The images have the light
+    `light` (e.g. "clear") and random scenery by `seed`. Raises UserError for another name, a
+    missing model, or a service that does not answer.
     """
     check_perception(name, model)
     if name == "truth":

@@ -49,8 +49,12 @@ class PerceivedLaw:
     def steer(
         self, state: CarState, offset: float, curvature: float, path_angle: float = 0.0
     ) -> float:
-        """Return the steering action towards a path, which is `offset` m left of the middle of the
-        road and turned by `path_angle` rad to the left of it."""
+        """Return the steering action in [-1, 1] towards a path, which is `offset` m left of the
+        middle of the road and turned by `path_angle` rad to the left of the road.
+
+        The path's `curvature` is not used. `state` is the true state, of which only the car's own
+        speeds and yaw rate and the lane that it is in are used.
+        """
         perceived = self._perceive(self._world)
         error = None
         if perceived.to_lane_centre is not None:
@@ -79,7 +83,8 @@ class PerceivedLaw:
 
 @dataclass(frozen=True)
 class MakePerceivedLaw:
-    """Makes the steering law of a round when called; it is pickled for the recording processes."""
+    """Makes the steering law of a round when called. The object is pickled for the recording
+    processes."""
 
     controller: str
     model: str
