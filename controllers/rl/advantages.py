@@ -23,7 +23,8 @@ def advantages_of(
 
     All arrays are (T, N). `values`, `next_values`: values of the states before and after the steps,
     the latter before any reset. `ended`: the step reached a terminal state, whose value is 0.
-    `over`: the step was the last one of its episode, so the sum over later steps stops here.
+    `over`: the step was the last one of its episode, so later steps do not count. `discounts`:
+    discount factor of each step. `gae_lambda`: lambda of Schulman et al., 0 to 1.
     """
     found = np.zeros_like(rewards)
     errors = rewards + discounts * next_values * ~ended - values
@@ -35,7 +36,8 @@ def advantages_of(
 
 
 def discounts_at(speeds: Array, length_m: float) -> Array:
-    """Return the discount factors exp(-distance / length_m) of control steps at `speeds` (m/s)."""
+    """Return the discount factors exp(-distance / length_m) of control steps at `speeds` (m/s, at
+    least 1), an array of any shape."""
     distances = STEP_S * np.maximum(speeds, SLOWEST_M_S)
     factors: Array = np.exp(-distances / length_m).astype(np.float32)
     return factors

@@ -30,14 +30,15 @@ class Replay:
     def add(
         self, state: Array, action: float, reward: float, next_state: Array, ended: bool
     ) -> None:
-        """Store a transition; it overwrites the oldest one when the replay is full."""
+        """Store a transition between states (size,); it overwrites the oldest one when the replay
+        is full."""
         place = self.added % len(self.states)
         self.states[place], self.next_states[place] = state, next_state
         self.results[place] = action, reward, ended
         self.added += 1
 
     def sample(self, places: NDArray[np.int64]) -> Batch:
-        """Copies of the transitions with the indices `places` (B,)."""
+        """Return copies of the transitions with the indices `places` (B,)."""
         results = self.results[places]
         return Batch(
             self.states[places],
@@ -70,7 +71,8 @@ class Agent:
         self._order, self._signs = mirror_of(definition)
 
     def see(self, state: Array) -> Array:
-        """Return the input of the networks for states (..., size): the states over `divisor`."""
+        """Return the input of the networks for states (..., size): the states divided by their
+        typical size, if the algorithm scales them."""
         return np.asarray(state / self.divisor, np.float32)
 
     def act(self, seen: Array) -> float:
@@ -84,9 +86,10 @@ class Agent:
     def remember(
         self, seen: Array, action: float, reward: float, next_seen: Array, ended: bool
     ) -> None:
-        """Add a transition to the replay.
+        """Add a transition between inputs of the networks (size,) to the replay.
 
-        With a baseline, a terminal state is worth the baseline's reward repeated for ever.
+        The algorithm's `reward_baseline` is subtracted from the reward. A terminal state is
+        followed for ever by steps of reward 0, from which the baseline is subtracted, too.
         """
         of = self.algorithm
         value = reward - of.reward_baseline
@@ -116,7 +119,8 @@ class Agent:
         return flat | {name: flat[name].reshape(-1) for name in ("b1", "b2", "w3", "b3")}
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """Return all arrays and counts that a continued training needs, by name."""
+        """Return the arrays (networks, moments, replay) and the counts (updates, transitions added)
+        that a continued training needs, by name."""
         filled = {name: array[: len(self.replay)] for name, array in self._replayed().items()}
         counts = {"updates": self.updates, "added": self.replay.added}
         return self._parameters() | filled, counts

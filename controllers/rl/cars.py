@@ -63,11 +63,11 @@ class Step:
 
 
 class Cars:
-    """N cars on `tracks` (N names). The cars in the mask `disturbed` (N,) get new random parameters
-    in each episode.
+    """N cars on `tracks` (N names). The cars whose element of `disturbed` (N,) is True get new
+    random parameters, noise and delay in each episode.
 
-    `starts`: fixed values or ranges of the start, for the environment's reset. `episode`: least and
-    greatest number of steps of an episode. `half_width_m`: divisor of the lateral offset.
+    `starts`: fixed values or ranges of the start, for the environment's reset, by name. `episode`:
+    least and greatest number of steps of an episode. `half_width_m`: divisor of the lateral offset.
     """
 
     def __init__(
@@ -115,7 +115,8 @@ class Cars:
         self._privileged = np.zeros((self.count, privileged.SIZE), np.float32)
 
     def reset(self, seed: int) -> Array:
-        """Begin an episode of each car. All later steps depend only on `seed` and the actions."""
+        """Begin an episode of each car; return the first states (N, size). All later steps depend
+        only on `seed` and the actions."""
         self._rng = np.random.default_rng(seed)
         observed, info = self._envs.reset(seed=seed)
         self._begin(self._everyone)

@@ -47,11 +47,13 @@ class Learner(Protocol):
     """Networks in training, whose state can be stored and restored."""
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """Return all arrays and counts that a continued training needs, by name."""
+        """Return the arrays, and the counts (e.g. of updates), that a continued training needs, by
+        name."""
         ...
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:
-        """Restore the result of `store`. Raises KeyError or ValueError for other arrays."""
+        """Restore the result of `store`. Raises KeyError for a missing array or count, ValueError
+        for an array of another shape."""
         ...
 
 

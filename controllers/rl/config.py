@@ -88,7 +88,7 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """The settings of `ppo`. Fields without a text are named as in Schulman et al. 2017."""
+    """The settings of `ppo`. Fields without a description are named as in Schulman et al. 2017."""
 
     discount_length_m: float = 15.0
     """The discount factor of a step is exp(-distance of the step / discount_length_m): 0.94 at
@@ -206,7 +206,8 @@ class TrainConfig:
 
 
 def resolve(config: TrainConfig) -> TrainConfig:
-    """Return `config` with the defaults that depend on the number of cars."""
+    """Return `config` with the number of cars, the track, the steps and the steps between
+    evaluations; a missing value gets the default for one car or for several cars."""
     many = config.vectorised
     defaults: dict[str, Any] = {
         "envs": 256 if many else 1,

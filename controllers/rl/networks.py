@@ -78,8 +78,8 @@ def layers(theta: Array, shape: Shape) -> Layers:
 
 
 def initial(shape: Shape, count: int, rng: np.random.Generator) -> Array:
-    """Return random initial parameters (count, P): uniform within +-1 / sqrt(inputs of the layer),
-    in the output layer within +-SMALL_OUTPUT."""
+    """Return random initial parameters (count, P): uniform within +-1 / sqrt(inputs of the layer);
+    in the output layer, weights within +-0.003 and bias 0."""
     theta = np.zeros((count, shape.parameters), np.float32)
     of = layers(theta, shape)
     for weights, bias in ((of.w1, of.b1), (of.w2, of.b2)):
@@ -91,7 +91,8 @@ def initial(shape: Shape, count: int, rng: np.random.Generator) -> Array:
 
 
 def forward(of: Layers, x: Array, actions: Array | None = None) -> Activations:
-    """Compute the activations for states `x` (B, state) and, for critics, `actions` (B,)."""
+    """Return the activations of N networks for states `x` (B, state) and, for critics, `actions`
+    (B,)."""
     z = np.matmul(x, of.w1)
     z += of.b1
     np.maximum(z, 0.0, out=z)
@@ -110,8 +111,9 @@ def forward(of: Layers, x: Array, actions: Array | None = None) -> Activations:
 def backward(of: Layers, seen: Activations, g_out: Array, gradient: Layers | None) -> Array:
     """Fill `gradient` with the gradient of sum(g_out * out) with respect to the parameters.
 
-    `g_out` is (N, B). Returns the gradient with respect to z (N, B, h1 + actions); its last column
-    is a critic's gradient with respect to the action.
+    `g_out` is (N, B). `seen` is the result of `forward`. Returns the gradient with respect to
+    `seen.z` (N, B, h1 + actions), the input of hidden 2; its last column is a critic's gradient
+    with respect to the action.
     """
     g2 = g_out[:, :, None] * of.w3.transpose(0, 2, 1)
     g2 *= seen.h2 > 0.0

@@ -33,7 +33,8 @@ class OffPolicy:
         return self._agent.act_all(self._agent.see(states))
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
-        """Return actions (N,) with the paper's noise, whose probability falls in the training."""
+        """Return the present actor's actions (N,) with random noise, whose probability falls in the
+        training."""
         agent, count = self._agent, len(states)
         noise = agent.algorithm.beta * EXPLORATION_NOISE * rng.standard_normal(count, np.float32)
         noise *= rng.random(count) < exploration_share(agent.replay.added)
@@ -42,8 +43,8 @@ class OffPolicy:
     def learn(
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
     ) -> dict[str, float]:
-        """Add the transitions of a step to the replay and update the networks; returns figures of
-        the updates, {} without an update.
+        """Add the transitions of a step to the replay and update the networks; return the means of
+        the critics' loss and of the reward by name, {} before the first update.
 
         `left`: share of the training that remains, from 1 down to 0.
         """
@@ -62,11 +63,11 @@ class OffPolicy:
         return {"loss": float(np.mean(losses)), "reward": float(step.rewards.mean())}
 
     def weights(self) -> dict[str, Array]:
-        """Return the arrays of an actor's file (w1, b1, w2, b2, w3, b3)."""
+        """Return the arrays of an actor's file (w1, b1, w2, b2, w3, b3) for the target actor."""
         return self._agent.weights()
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """Return all arrays and counts that a continued training needs, by name."""
+        """Return the arrays and the counts of `Agent.store`, by name."""
         return self._agent.store()
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:

@@ -9,12 +9,12 @@ standard deviation that does not depend on the state. Advantages are generalised
 - An episode that is cut by its number of steps continues with the value of its last state.
 - The discount factor of a step depends on the distance driven in it, not on its duration: a slow
   car needs more steps, but not more metres, to return to the middle of the road.
-- Advantages are divided by their typical size in the state, which the critic's second output
+- Advantages are divided by their typical size in the same state, which the critic's second output
   learns: at the start, where the car is slow, they are small but cost most of the score. Then they
   are divided by their mean absolute deviation, not by their standard deviation, and limited to 4
   times it: an early end costs hundreds of times as much as a usual step, and would hide all others.
 - The critic also receives the exact state and the road ahead (`privileged`).
-- The standard deviation is at least LEAST_STD.
+- The standard deviation is at least 0.05.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
   there is no bonus for entropy.
 - Rewards and states are scaled by constants instead of running means.
@@ -56,13 +56,14 @@ LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 def scaled(advantages: Tensor) -> Tensor:
     """Return `advantages` (B,) minus their mean, divided by their mean absolute deviation and
-    clipped to +-ADVANTAGE_LIMIT."""
+    clipped to +-4."""
     centred = advantages - advantages.mean()
     return (centred / (centred.abs().mean() + 1e-8)).clamp(-ADVANTAGE_LIMIT, ADVANTAGE_LIMIT)
 
 
 def clipped_loss(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
-    """PPO's loss -mean min(r A, clip(r, 1 - clip, 1 + clip) A), r = exp(log_ratio); inputs (B,)."""
+    """Return the loss -mean min(r A, clip(r, 1 - clip, 1 + clip) A) with r = exp(`log_ratio`) and
+    the `advantages` A, both (B,)."""
     ratio = log_ratio.exp()
     limited = ratio.clamp(1.0 - clip, 1.0 + clip)
     return -torch.min(ratio * advantages, limited * advantages).mean()
@@ -76,7 +77,7 @@ def log_density(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
 
 class Policy(nn.Module):
     """The actor with its standard deviation, and the critic. The actor's input is a scaled state
-    (B, size), the critic's a scaled state with its privileged state (B, size + privileged.SIZE)."""
+    (B, size), the critic's a scaled state with its privileged state (B, size + 21)."""
 
     def __init__(
         self, definition: StateDefinition, settings: PpoSettings, generator: torch.Generator
@@ -100,11 +101,12 @@ class Policy(nn.Module):
         return 0.5 * (out[:, 0] - out[:, 1])
 
     def value(self, states: Tensor) -> Tensor:
-        """Return the values (B,) of scaled states with privileged states."""
+        """Return the values (B,) of scaled states with privileged states (B, size + 21)."""
         return self.value_and_size(states)[0]
 
     def value_and_size(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the values (B,), and the logarithms (B,) of the typical size of an advantage."""
+        """Return for scaled states with privileged states (B, size + 21) the values (B,), and the
+        logarithms (B,) of the typical size of an advantage."""
         values, sizes = self.critic(states).unbind(1)
         return values, sizes
 
@@ -128,8 +130,8 @@ def _layers(
 
 @dataclass
 class Rollout:
-    """The last T steps of N cars. `states` (before a step) and `last` (after it) are scaled states
-    with privileged states (T, N, size + privileged.SIZE); all other arrays are (T, N)."""
+    """The last T steps of N cars. `states` (before each step) and `last` (after it) are scaled
+    states with privileged states (T, N, size + 21); all other arrays are (T, N)."""
 
     states: Array
     last: Array
@@ -157,8 +159,8 @@ class Ppo:
         seed: int,
         threads: int = 1,
     ) -> None:
-        """With 2 threads or more, actor and critic are updated at the same time. The networks do
-        not depend on `threads`."""
+        """`cars` is N. With 2 `threads` or more, actor and critic are updated at the same time. The
+        networks do not depend on `threads`."""
         self.settings, self.odd = settings, True
         self.horizon = settings.horizon
         self.policy = Policy(definition, settings, torch.Generator().manual_seed(seed))
@@ -188,8 +190,8 @@ class Ppo:
     def learn(
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
     ) -> dict[str, float]:
-        """Add a step of the cars; every `horizon` steps update the networks. Returns figures of the
-        update, {} without an update.
+        """Add a step of all cars to the rollout; update the networks after every `horizon` steps.
+        Returns the losses and other measures of the update by name, {} without an update.
 
         `left`: share of the training that remains, from 1 down to 0.
         """

@@ -3,8 +3,8 @@ state.
 
 Only the training needs a critic, so its input can contain more than the actor's (an asymmetric
 actor-critic: Pinto et al. 2018). The actor's state is noisy and late, and does not contain the
-curvature of the road. With this state alone a critic would attribute the effect of a bend to the
-action before it.
+curvature of the road. With the actor's state alone a critic would attribute the effect of a bend to
+the action before it.
 """
 
 import numpy as np
@@ -57,7 +57,8 @@ def privileged_state(
     delay: NDArray[np.int64],
     noise: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the privileged states (N, SIZE) of the cars of `fleet`, divided by SPREAD.
+    """Return the privileged states (N, 21) of the cars of `fleet`: the numbers PARTS, each divided
+    by its typical size.
 
     The arguments are arrays (N,): `throttle` in [0, 1], `delay` in control steps, and `noise`, the
     standard deviation of the perception's noise as a share of its largest value.

@@ -124,7 +124,8 @@ class RunFolder:
     def add_evaluation(self, score: float, mean_m: float, max_m: float, actor: Actor) -> None:
         """Add a point to the curves, save the `actor` if it is the best, and write a checkpoint.
 
-        `score` is the reward per step; `mean_m` and `max_m` are the mean and largest offset.
+        `score` is the reward per step; `mean_m` and `max_m` are the mean and the largest offset
+        (m).
         """
         progress = self.progress
         self.tick()
@@ -145,7 +146,8 @@ class RunFolder:
         save_checkpoint(self._run, self._learner, progress)
 
     def result(self) -> dict[str, Any]:
-        """Return the figures that `controllers train` prints."""
+        """Return the result of the training: the folder, the steps, episodes and seconds, and the
+        step and the score per step of the best actor."""
         progress = self.progress
         return {
             "out": str(self._run),

@@ -71,7 +71,7 @@ def critic_update(
 
 
 def actor_update(actor: Trained, critics: Trained, shape: Shape, states: Array) -> None:
-    """Fill the actor's gradient of the loss -mean Q(s, mu(s)) with the first critic's Q.
+    """Fill `actor.gradient` with the gradient of the loss -mean Q(s, mu(s)); Q is the first critic.
 
     `shape` is the shape of a critic, `states` is (B, state).
     """
