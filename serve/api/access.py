@@ -37,9 +37,9 @@ class Access:
         self._count_refusal = count_refusal
 
     def refusal(self, headers: Headers, client: str) -> Reply | None:
-        """The refusal of a request POST /features; None if the request is accepted.
+        """Return the reply that refuses a request POST /features; None if the request is accepted.
 
-        No header name may occur twice in the request.
+        The caller must have refused a request in which a header name occurs twice.
         """
         try:
             self._rate_limiter.check(client)
@@ -50,8 +50,8 @@ class Access:
         return None
 
     def scope_refusal(self, scope: Scope) -> Reply | None:
-        """The refusal of a request for any path, from its ASGI scope; None if it is accepted. A
-        header name can occur twice."""
+        """Return the reply that refuses a request for any path, from its ASGI scope; None if the
+        request is accepted. A header name can occur twice."""
         path, headers, client = scope["path"], dict(scope["headers"]), client_address(scope)
         try:
             public = _is_public(path)
@@ -90,7 +90,9 @@ class HostCheck:
     def check(self, headers: Headers, *, probe: bool = False, version: str = "1.1") -> None:
         """Raise Problem if the Host or the Origin is not accepted.
 
-        With `probe` any Host is accepted: probes use the address of a pod.
+        With `probe`, for the paths of health checks, any Host is accepted, because a load balancer
+        sends the address of the container. A request of HTTP `version` 1.0 needs no Host if the
+        service has a token.
         """
         host, origin = headers.get(b"host"), headers.get(b"origin")
         if host is None and (version != HTTP_1_0 or not self._any_name):

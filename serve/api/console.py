@@ -43,7 +43,7 @@ def add_console(app: FastAPI) -> None:
 
 
 def docs_page(app: FastAPI) -> str:
-    """The HTML of `/docs`. The page contains the OpenAPI document, because /openapi.json can
+    """Return the HTML of `/docs`. It contains the OpenAPI document, because /openapi.json can
     require a token."""
     document = json.dumps(app.openapi()).replace("<", "\\u003c")
     return (FOLDER / "docs.html").read_text(encoding="utf-8").replace("{{openapi}}", document)

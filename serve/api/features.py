@@ -65,8 +65,8 @@ class ImageCamera:
     camera: CameraParameters | None = None
 
     def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
-        """[left, top, width, height] in px of the part of an image that the model's camera `view`
-        shows; None if the part is the whole image, or if the image is warped.
+        """Return [left, top, width, height] in px of the part of an image that the model's camera
+        `view` shows; None if the part is the whole image, or if the image is warped.
 
         Raises ImageError if an image of this size does not cover what `view` shows.
         """
@@ -106,7 +106,7 @@ class FrameHandler:
         self._log_answers = log_answers
 
     def share(self) -> BodyShare:
-        """The share of a new request in the budget for bodies, initially 0 bytes."""
+        """Return a new request's share, initially 0 bytes, of the memory for request bodies."""
         return BodyShare(self._bodies)
 
     def submit(
@@ -114,7 +114,7 @@ class FrameHandler:
     ) -> list[int] | None:
         """Queue the image file in `body`; `on_result` is called with its result or an error.
 
-        Returns `crop_px` of the answer. Raises Problem, ImageError.
+        Returns the used part of the image as `ImageCamera.crop_px`. Raises Problem, ImageError.
         """
         self.queue.check_ready()
         camera, source = self.queue.loaded.engine.card.camera, self.image_camera(options)
@@ -131,7 +131,7 @@ class FrameHandler:
         return crop
 
     def image_camera(self, options: RequestOptions) -> ImageCamera:
-        """The camera of a request's image. Raises Problem for an unknown camera."""
+        """Return the camera of a request's image. Raises Problem for an unknown camera."""
         name = options.camera
         if name is None:
             return ImageCamera(options.fov_y_deg)
@@ -146,8 +146,8 @@ class FrameHandler:
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
     ) -> dict[str, Any]:
-        """The answer to the image file in `body`, a dict with the members of `schemas.Features`.
-        Raises Problem, ImageError."""
+        """Return the answer to the image file in `body`, a dict with the members of
+        `schemas.Features`. Raises Problem, ImageError."""
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         crop = self.submit(options, body, client, partial(resolve, future))
         del body
@@ -161,8 +161,8 @@ class FrameHandler:
     async def predict_pixels(
         self, options: RequestOptions, client: str, read: PixelReader, read_ms: float
     ) -> FrameResult:
-        """The result for the pixels that `read` returns; `read_ms` is the estimated time it takes.
-        Raises Problem, ImageError."""
+        """Return the result for the pixels that `read` returns; `read_ms` is the estimated time
+        (ms) that `read` takes. Raises Problem, ImageError."""
         future: asyncio.Future[FrameResult] = asyncio.get_running_loop().create_future()
         frame = _frame(options, client, read, read_ms, False, self.image_camera(options))
         self.queue.submit(frame, partial(resolve, future))
@@ -181,8 +181,8 @@ class FrameHandler:
         result: FrameResult,
         span: "Span | None" = None,
     ) -> None:
-        """Count an answer, and log it if `log_answers` is set. `span` is the span of its
-        request."""
+        """Count an answer, and log it if `log_answers` is set. `span` is the request's span in a
+        trace."""
         total_s = (time.monotonic_ns() - options.stamp_ns) / 1e9
         self._metrics.count_answer(result, total_s, self.queue.waiting)
         if self._log_answers:
@@ -201,7 +201,7 @@ class FrameHandler:
     def record_problem(
         self, problem: Problem, request_id: str, client: str, span: "Span | None" = None
     ) -> None:
-        """Count and log the problem of a request. `span` is the span of the request."""
+        """Count and log the problem of a request. `span` is the request's span in a trace."""
         self.count_refusal(problem, request_id, client)
         if self.tracer is not None:
             self.tracer.record_problem(span, problem, request_id)
@@ -213,9 +213,9 @@ class FrameHandler:
 
 
 class FeaturesRequest:
-    """One request, from its headers to its reply: call `open`, then `submit` with its body.
+    """One request, from its headers to its reply: call `open`, then `submit` with the body.
 
-    `send` is called once with the reply. If the client disconnects before its body is complete,
+    `send` is called once with the reply. If the client disconnects before the body is complete,
     call `abandon`; then `send` is not called.
     """
 
@@ -238,7 +238,8 @@ class FeaturesRequest:
         self._share.close()
 
     def open(self, headers: Headers) -> bool:
-        """Check the headers; returns False after a refusal, when the body is not needed."""
+        """Check the headers; return True if the body is needed, False if the request was
+        refused."""
         stamp_ns = time.monotonic_ns()
         self._request_id = request_id_of(headers)
         frames = self._frames
@@ -333,7 +334,7 @@ def _frame(
 def response_content(
     options: RequestOptions, result: FrameResult, crop: list[int] | None
 ) -> dict[str, Any]:
-    """The members of the answer. For speed, only the tests validate them against the schema."""
+    """Return the members of the answer. For speed, only tests validate them against the schema."""
     return {
         **result.prediction.as_json(),
         **result.provenance,

@@ -1,5 +1,5 @@
-"""POST /features as an ASGI application: for other servers, and for the requests that
-`serve.server.fast_path` hands to ASGI."""
+"""POST /features as an ASGI application, for the requests that `serve.server.fast_path` does not
+handle, and for ASGI servers other than `serve.server`."""
 
 import asyncio
 from functools import partial

@@ -104,7 +104,7 @@ class _RawRequest(_Misplaced):
 
 
 def read_json_length(body: bytes, header: bytes | None) -> int:
-    """Size of the JSON part of `body` in bytes: `header`, or the whole body. Raises Problem."""
+    """Return the size in bytes of the JSON part: `header`, or all of `body`. Raises Problem."""
     if header is None:
         return len(body)
     usable = header.isdigit() and len(header) <= MAX_LENGTH_DIGITS
@@ -179,7 +179,7 @@ def _check_flag(parameters: dict[str, Any], name: str, where: str) -> None:
 
 
 def take_options(request: InferRequest) -> dict[str, Any]:
-    """The parameters of a request that are options of its image."""
+    """Return the parameters of a request that are options of its image, by name."""
     return {name: value for name, value in request.parameters.items() if name in OPTIONS}
 
 
@@ -252,7 +252,7 @@ class Pixels:
 
 
 def find_pixels(tensor: Tensor, binary: memoryview) -> Pixels:
-    """Check the UINT8 tensor of a request; a leading 1 of its shape is ignored. Raises Problem."""
+    """Check a UINT8 tensor ([1,] height, width, 3); return it undecoded. Raises Problem."""
     shape = tensor.shape[1:] if len(tensor.shape) == 4 and tensor.shape[0] == 1 else tensor.shape
     usable = len(shape) == 3 and shape[2] == 3 and min(shape) > 0 and max(shape) < MAX_SIDE
     if tensor.datatype != "UINT8" or not usable:
@@ -319,8 +319,8 @@ def _binary(tensor: Tensor, binary: memoryview) -> memoryview | None:
 def encode_response(
     head: dict[str, Any], tensors: dict[str, NDArray[np.float32]], request: InferRequest
 ) -> tuple[bytes, int | None]:
-    """Encode the body of the answer. Returns it and the size of its JSON part in bytes, None if the
-    whole body is JSON. Raises Problem."""
+    """Encode an answer: `head` and the requested `tensors`. Returns the body and the size of its
+    JSON part in bytes, which is None if the whole body is JSON. Raises Problem."""
     requested = request.outputs or [RequestedOutput(name) for name in tensors]
     default = request.parameters.get(ALL_BINARY, False)
     outputs, parts = [], []
@@ -346,5 +346,5 @@ def encode_response(
 
 
 def invalid_request(detail: str) -> Problem:
-    """The problem of a request that violates the protocol."""
+    """Make the problem of a request that violates the protocol."""
     return Problem(INVALID_REQUEST, detail)

@@ -73,7 +73,7 @@ class ResponseFormat:
 
     @property
     def header(self) -> tuple[bytes, bytes]:
-        """The Content-Type header of an answer."""
+        """Name and value of the Content-Type header of an answer."""
         return b"content-type", self.media_type.encode()
 
 
@@ -91,7 +91,8 @@ KSERVE_FORMATS: Formats = (JSON, TENSORS)
 
 @lru_cache(256)
 def negotiate(accept: str, formats: Formats = FORMATS) -> ResponseFormat:
-    """The format that an `Accept` header prefers (RFC 9110, 12.5.1). Raises Problem."""
+    """Return the format that `accept` prefers (RFC 9110, 12.5.1). Raises Problem if there is
+    none."""
     if not accept.strip():
         return formats[0]
     ranges = [_parse_media_range(item) for item in accept.split(",")]
@@ -141,7 +142,7 @@ class RequestOptions:
 
 
 def read_options(scope: MutableMapping[str, Any]) -> Headers:
-    """The headers of an ASGI scope, together with the options of its query.
+    """Return the headers of an ASGI scope, to which the options in its query are added.
 
     Raises Problem, also for an option that is given twice: one of the values would be ignored.
     """
@@ -158,7 +159,7 @@ def read_options(scope: MutableMapping[str, Any]) -> Headers:
 
 
 def parse_query(query: bytes) -> dict[str, str]:
-    """The options in a query. Raises Problem for an option that is given twice."""
+    """Return the options in a query by name. Raises Problem for an option that is given twice."""
     if not query:
         return {}
     try:
@@ -172,8 +173,8 @@ def parse_query(query: bytes) -> dict[str, str]:
 
 
 def single_options(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
-    """The pairs (name, value) of options as a dictionary. Raises Problem if a name occurs twice;
-    `where` is the source of the options, for the message."""
+    """Return the pairs (name, value) of options as a dictionary. Raises Problem if a name occurs
+    twice; `where` is the source of the options, for the message."""
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
@@ -183,7 +184,8 @@ def single_options(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
 
 
 def merge_options(headers: Headers, options: Mapping[str, Any], where: str) -> Headers:
-    """`headers` together with the `options` found in `where` (a query, or `parameters`).
+    """Return `headers` with the `options` found in `where` (a query, or `parameters`) added as
+    headers.
 
     Raises Problem for an option that is unknown, is also a header, or has the wrong type.
     """
@@ -213,8 +215,8 @@ def check_names(options: Mapping[str, Any], known: Mapping[str, Any], where: str
 
 
 def parse_json_object(text: str | bytes, where: str) -> dict[str, Any] | None:
-    """Parse the JSON object in `text`; None for other text. Raises Problem if a name occurs twice;
-    `where` is the text's origin, for the message."""
+    """Parse the JSON object in `text`; return None for a text that is no JSON object. Raises
+    Problem if a name occurs twice; `where` is the text's origin, for the message."""
     try:
         content = json.loads(text, object_pairs_hook=lambda pairs: single_options(pairs, where))
     except (ValueError, RecursionError):
@@ -225,7 +227,8 @@ def parse_json_object(text: str | bytes, where: str) -> dict[str, Any] | None:
 def parse_options(
     headers: Headers, stamp_ns: int, request_id: str, formats: Formats = FORMATS
 ) -> RequestOptions:
-    """Parse the options in the headers of a request that began at `stamp_ns`. Raises Problem."""
+    """Parse the options in the headers of a request that began at `stamp_ns` (ns of the monotonic
+    clock). `formats` are the possible formats of the answer. Raises Problem."""
     for name in headers:
         if name.startswith(OPTION_HEADERS) and name not in HEADER_KEYS:
             seen = f"the request has an unknown header {name[:40].decode('latin-1')!r}"
@@ -243,7 +246,8 @@ def parse_options(
 
 
 def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFormat:
-    """The format of the answer that the value of the Accept header requests. Raises Problem."""
+    """Return the format of the answer that the value of the Accept header requests. Raises
+    Problem."""
     if accept is None or accept == b"*/*":
         return formats[0]
     if len(accept) > MAX_ACCEPT:
@@ -253,7 +257,7 @@ def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFo
 
 
 def parse_name(sent: bytes | None, header: str) -> str | None:
-    """Check the value `sent` of a header with a name or id; None without it. Raises Problem."""
+    """Return the name or id in a header's value `sent`; None without the header. Raises Problem."""
     if sent is None:
         return None
     if not is_name(sent):
@@ -265,12 +269,12 @@ def parse_name(sent: bytes | None, header: str) -> str | None:
 
 
 def is_name(sent: bytes) -> bool:
-    """Whether `sent` is printable ASCII of 1 to MAX_NAME characters."""
+    """Whether `sent` is printable ASCII of 1 to 128 characters."""
     return 0 < len(sent) <= MAX_NAME and sent.isascii() and sent.decode("ascii").isprintable()
 
 
 def request_id_of(headers: Headers) -> str:
-    """The id of a request: the client's id if it is valid, else a new id."""
+    """Return the id of a request: the client's id if it is valid, else a new id."""
     sent = headers.get(b"x-request-id")
     if sent and is_name(sent):
         return sent.decode("ascii")
@@ -278,8 +282,8 @@ def request_id_of(headers: Headers) -> str:
 
 
 def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
-    """Convert a deadline, sent in ms after `stamp_ns`, to ns of the monotonic clock. Raises
-    Problem."""
+    """Convert a deadline, sent in ms after `stamp_ns`, to ns of the monotonic clock; None if no
+    deadline was sent. Raises Problem."""
     if sent is None:
         return None
     wait_ms = _parse_number(sent, DEADLINE, 0.0, MAX_DEADLINE_MS)
@@ -287,7 +291,8 @@ def parse_deadline(sent: bytes | str | None, stamp_ns: int) -> int | None:
 
 
 def parse_fov_deg(sent: bytes | str | None) -> float | None:
-    """Parse the vertical field of view of an image, sent in degrees. Raises Problem."""
+    """Parse the vertical field of view of an image, sent in degrees (1 to 179); None if it was not
+    sent. Raises Problem."""
     return None if sent is None else _parse_number(sent, FIELD_OF_VIEW, MIN_FOV_DEG, MAX_FOV_DEG)
 
 
@@ -307,7 +312,8 @@ def _parse_number(sent: bytes | str, header: str, low: float, high: float) -> fl
 
 
 def check_image_headers(headers: Headers) -> None:
-    """Raise Problem if the headers show that the body is not a usable image."""
+    """Raise Problem unless the headers announce a JPEG or PNG file, uncompressed and not too
+    large."""
     sent = headers.get(b"content-type", b"")
     if (
         sent not in IMAGE_MEDIA_TYPES
@@ -323,7 +329,7 @@ def check_image_headers(headers: Headers) -> None:
 
 
 def check_body_headers(headers: Headers) -> None:
-    """Raise Problem if the headers announce a compressed or too large body."""
+    """Raise Problem if the headers announce a compressed body or a body of more than 4 MiB."""
     coding = headers.get(b"content-encoding", b"identity")
     if coding.strip().lower() != b"identity":
         raise Problem(

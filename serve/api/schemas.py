@@ -183,7 +183,8 @@ HEADERS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def image_parameters() -> list[dict[str, Any]]:
-    """OpenAPI parameters of an image: its request headers, and the same options in the query."""
+    """Return the OpenAPI parameters of an image: its request headers, and the same options in the
+    query."""
     common = {"in": "header", "required": False}
     found = [
         {"name": name, **common, "description": text, "schema": schema}
@@ -197,7 +198,7 @@ def image_parameters() -> list[dict[str, Any]]:
 
 
 def features_operation() -> dict[str, Any]:
-    """OpenAPI operation of POST /features, which is not a route of FastAPI."""
+    """Return the OpenAPI operation of POST /features, which is not a route of FastAPI."""
     schema = {"$ref": "#/components/schemas/Features"}
     return {
         "summary": "Track features of one driver-view image",
@@ -225,7 +226,8 @@ def features_operation() -> dict[str, Any]:
 
 
 def problem_responses(*types: ProblemType) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI responses of a route whose requests can be refused with these problems."""
+    """Return by HTTP status the OpenAPI responses of a route whose requests can be refused with the
+    problems `types`."""
     statuses = dict.fromkeys(found.status for found in types)
     schema = {"$ref": "#/components/schemas/ProblemDetails"}
     return {
@@ -238,7 +240,8 @@ def problem_responses(*types: ProblemType) -> dict[int | str, dict[str, Any]]:
 
 
 def add_common_responses(operation: dict[str, Any], needs_token: bool) -> None:
-    """Add the refusals that every request can get to an operation's own responses."""
+    """Add the problems that any request can have to the responses of `operation`, with the problem
+    of a missing token if `needs_token` is set."""
     types = (*SERVER_REFUSALS, *AUTHORIZATION_REFUSALS) if needs_token else SERVER_REFUSALS
     responses = operation["responses"]
     for status, response in problem_responses(*types).items():
