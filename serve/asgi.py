@@ -17,7 +17,7 @@ class ClientDisconnectedError(Exception):
 
 
 def client_address(scope: Scope) -> str:
-    """The client's address; empty if it is unknown."""
+    """Return the client's address; it is empty if it is unknown."""
     client = scope.get("client")
     return client[0] if client else ""
 
@@ -47,7 +47,8 @@ async def send_reply(send: Send, reply: Reply, protocol: str = "http") -> None:
 
 
 def without_body(send: Send) -> Send:
-    """Wrap `send` for answers to HEAD: send the headers of a GET (with Content-Length), no body."""
+    """Return a `send` for answers to HEAD: it sends the headers of a GET (with Content-Length), no
+    body."""
 
     async def send_head(message: Message) -> None:
         await send({**message, "body": b""} if "body" in message else message)

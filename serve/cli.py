@@ -197,5 +197,5 @@ def ray(
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the command `serve`."""
     command.main(app)

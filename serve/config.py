@@ -75,8 +75,8 @@ def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
 
 @lru_cache(4096)
 def network_of(address: str) -> str:
-    """Name of the client that an address belongs to: an IPv4 address itself (also of an IPv4-mapped
-    IPv6 address), or the /64 network of another IPv6 address, since a client usually owns a /64."""
+    """Return the network of a client: its IPv4 address itself (also of an IPv4-mapped IPv6
+    address), or the /64 network of another IPv6 address, since a client usually owns a /64."""
     try:
         found = ip_address(address.partition("%")[0])
     except ValueError:

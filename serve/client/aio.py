@@ -41,7 +41,9 @@ class AsyncClient:
         timeout_s: float = 5.0,
         token: str | None = None,
     ) -> None:
-        """Raises ServiceError if `url` is not valid. Connects at the first request."""
+        """Connects at the first request. `timeout_s` is the time limit of one request. `token` is
+        the service's token; the default is $DRIVERVIEW_TOKEN, if it is set. Raises ServiceError if
+        `url` or `token` is not valid."""
         self._client = Client(url, timeout_s, token)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
         self._closed = False

@@ -52,8 +52,8 @@ class ServiceError(UserError):
 
 
 def retry_pause_s(error: ServiceError) -> float | None:
-    """Time in s to wait before the request that failed with `error` is sent again; None if a retry
-    is useless."""
+    """Return the time in s to wait before the request that failed with `error` is sent again; None
+    if a retry is useless."""
     if error.status is None:  # no reply: the service can be starting
         return RETRY_S
     if error.status not in (429, 503) or error.problem in NOT_RETRIED:
@@ -147,7 +147,7 @@ class Client:
             self._connection.sock.settimeout(seconds)
 
     def model(self) -> dict[str, Any]:
-        """The card of the served model. Raises ServiceError."""
+        """Return the card of the served model. Raises ServiceError."""
         return self._request("GET", "/model")
 
     def ready(self) -> bool:
