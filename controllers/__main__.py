@@ -1,4 +1,4 @@
-"""`python -m controllers` is the `controllers` command."""
+"""Runs the command `controllers` as `python -m controllers`."""
 
 from controllers.cli import main
 

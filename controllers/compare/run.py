@@ -198,7 +198,7 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
 
 
 def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
-    """Group by controller the drives that `drive_many` can make, which needs `update_batch`."""
+    """Return by controller the drives of `tasks` that `drive_many` can make at once."""
     groups: dict[str, list[Cell]] = {}
     for cell, (drive_config, _) in tasks.items():
         if can_join(drive_config):
@@ -223,8 +223,8 @@ def entry_of(cell: Cell, outcome: Outcome) -> Driven:
 
 
 def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> Driven:
-    """Make one drive; return its result, with curves if the seed is 0, or ContactsUnavailable.
-    `progress` is called with the steps done and their total number."""
+    """Make one drive; return its result, with curves if the seed is 0, or the error
+    ContactsUnavailable. `progress` is called with the steps done and their total number."""
     recorder = CurveRecorder()
     config, disturbance = task
     try:

@@ -227,7 +227,8 @@ class OffsetMemory:
         self._last = 0.0
 
     def fill(self, offset: float | None) -> float:
-        """Return `offset` (m); if it is None, the last offset for `hold_steps` steps and then 0."""
+        """Return `offset` (m). If it is None, return the last offset in the first `hold_steps`
+        steps without an offset, and 0 in later steps."""
         if offset is not None:
             self.age, self._last = 0, offset
             return offset

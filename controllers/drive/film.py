@@ -91,7 +91,7 @@ class DriveFilm:
 
 
 def caption(text: str, width: int) -> Image:
-    """Draw a line of text on a dark strip, an image (28, width, 3)."""
+    """Draw a line of text on a dark strip; return the RGB image (28, width, 3)."""
     strip = np.full((28, width, 3), BACK, np.uint8)
     cv2.putText(strip, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, TEXT_COLOUR, 1, cv2.LINE_AA)
     return strip

@@ -206,7 +206,8 @@ def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Pe
 
 
 def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
-    """Read the parameters of `controller` in a file of `controllers tune`; {} without a file.
+    """Read the parameters of `controller` in the file `path`, which `controllers tune` wrote;
+    return {} if `path` is None.
 
     Raises UserError for another kind of file, or for a file without parameters of the controller.
     """

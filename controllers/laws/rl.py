@@ -1,4 +1,4 @@
-"""A controller that steers by a trained actor; one `update` is three small numpy products."""
+"""A controller that steers by a trained actor; an `update` takes three small matrix products."""
 
 import math
 from dataclasses import replace

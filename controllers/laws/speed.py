@@ -82,7 +82,7 @@ class SpeedHold:
 def on_the_truth(speed: float, road: Road, lane_centre: float, dt: float) -> SpeedHold:
     """Return pedals that hold `speed` m/s and brake before the bends of `road`.
 
-    `lane_centre` is the line to follow, m left of the track's centre.
+    `lane_centre` is the line to follow, m left of the track's centre; `dt` is the control step (s).
     """
     profile = speed_profile(road.track, speed, abs(lane_centre))
 
@@ -96,7 +96,8 @@ def on_perception(speed: float, dt: float) -> SpeedHold:
     """Return pedals that hold `speed` m/s and slow down in bends, which they detect by the yaw rate
     and the perceived class of the road.
 
-    The slope is the pitch of the body, as an inclination sensor measures it.
+    `dt` is the control step (s). The slope of the road is the pitch of the body, as an inclination
+    sensor measures it.
     """
     return SpeedHold(speed, dt, CornerSpeed(dt), lambda now: math.tan(-now.pitch))
 

@@ -1,4 +1,4 @@
-"""Estimates the road's curvature from the car's own motion, for perceptions without a curvature."""
+"""Estimates the curvature of the road from the car's motion if the perception has no curvature."""
 
 from dataclasses import dataclass
 

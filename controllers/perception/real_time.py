@@ -137,7 +137,7 @@ class RealTimeFigures:
 
 
 class RealTimePerception(Generic[World, Frame, Answer]):
-    """A perception for `run_lap` that keeps the drive in real time; a context manager.
+    """A perception for `run_lap` that keeps the drive in real time; use it as a context manager.
 
     `capture` renders the frame of the present state, `source` answers it, and `read` converts the
     answer for the controller. `lost` decides for each answer whether it is lost. The clock starts

@@ -58,7 +58,7 @@ def truth(lane_centre: float) -> Perceive:
 
 
 class LocalModel:
-    """The model of a run, computed in this process."""
+    """The model of the run `run` (a folder or a name), computed in this process."""
 
     def __init__(self, run: str) -> None:
         from mtlnet.inference.engine import load_engine
@@ -135,7 +135,8 @@ class CameraPerception:
         return self.read(self.ask(self.capture(world)))
 
     def capture(self, world: "World") -> Image:
-        """Render the image of the present state. Call it in the thread that opened the camera."""
+        """Render the image (H, W, 3) RGB of the present state. Call it in the thread that opened
+        the camera."""
         image: Image = self.camera.render(world.body_pose(), world.traffic.poses())
         self.image = image
         return image

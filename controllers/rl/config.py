@@ -222,7 +222,8 @@ def resolve(config: TrainConfig) -> TrainConfig:
 def find_settings(config: TrainConfig) -> Algorithm | PpoSettings:
     """Return the settings of the algorithm, changed by the options in `config`.
 
-    Raises UserError for an unknown algorithm and for a learning rate out of range.
+    Raises UserError for an unknown algorithm and for a learning rate that is not finite and above
+    0.
     """
     if config.algorithm not in SETTINGS:
         raise UserError(

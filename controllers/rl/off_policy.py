@@ -67,7 +67,8 @@ class OffPolicy:
         return self._agent.weights()
 
     def store(self) -> tuple[Tensors, dict[str, int]]:
-        """Return the arrays and the counts of `Agent.store`, by name."""
+        """Return the arrays (networks, moments, replay) and the counts (updates, transitions added)
+        that a continued training needs, by name."""
         return self._agent.store()
 
     def restore(self, tensors: Tensors, counts: dict[str, int]) -> None:

@@ -70,7 +70,8 @@ def clipped_loss(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
 
 
 def log_density(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
-    """Return the logarithms (B,) of the normal densities of `actions` (B,) around `means` (B,)."""
+    """Return the logarithms (B,) of the normal densities of `actions` (B,) around `means` (B,),
+    with the standard deviation exp(`log_std`)."""
     z = (actions - means) * torch.exp(-log_std)
     return -0.5 * z * z - log_std - LOG_SQRT_2PI
 

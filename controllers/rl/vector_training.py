@@ -55,11 +55,12 @@ class VectorLearner(Learner, Protocol):
 def train_vector(
     config: TrainConfig, settings: Algorithm | PpoSettings, report: Report | None = None
 ) -> dict[str, Any]:
-    """Train as `config`, a result of `resolve`, describes, from the checkpoint of the run if it has
-    one; returns the figures that `controllers train` prints.
+    """Train as `config` describes, from the checkpoint of the run if it has one; return the figures
+    that `controllers train` prints.
 
-    Raises UserError for an unknown track, a state that is not supported with several cars, or a run
-    of another configuration.
+    `config` is a result of `resolve`, `settings` of `find_settings`. Raises UserError for an
+    unknown track, a state that is not supported with several cars, or a run of another
+    configuration.
     """
     definition = find_state(config.state)
     if definition.name not in (PAPER.name, HISTORY.name):
