@@ -28,8 +28,8 @@ TRUTH, PERCEIVED = "#2a9d5c", "#e07a2e"
 
 
 def spread(values: list[float], digits: int) -> str:
-    """Return the mean of `values` as text with `digits` decimals, with their standard deviation
-    ("0.99 ± 0.01") if there are several values."""
+    """Return the mean of `values` as text with `digits` decimals; the mean of several values is
+    followed by their standard deviation ("0.99 ± 0.01")."""
     mean = f"{np.mean(values):.{digits}f}"
     return mean if len(values) == 1 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 

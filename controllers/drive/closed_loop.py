@@ -1,5 +1,5 @@
-"""Closed-loop driving: each control step perceives the road, steers, moves the car and adds its
-reward. SI units, track frame, left positive.
+"""Closed-loop driving: in each control step the road is perceived, the car is steered and moved,
+and the reward is added. SI units, track frame, left positive.
 
 The throttle is constant, as in the paper, unless other `Pedals` are given. The result of `run_lap`
 depends only on the reset of the world, the controller, the pedals and the perception.
@@ -217,7 +217,8 @@ def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float
 
 
 class OffsetMemory:
-    """Supplies an offset in steps without a perceived one: the last offset, and after a time 0."""
+    """Bridges steps without a perceived offset by the last offset, for at most `hold_steps`
+    steps."""
 
     def __init__(self, hold_steps: int) -> None:
         self.blind_steps = 0
@@ -320,8 +321,8 @@ x, y and z in m."""
 
 
 class DriveLog:
-    """CSV log of a drive: a row for each control step has the state before it and the steering
-    action.
+    """CSV log of a drive. A row has the state before a control step, and the steering action of the
+    step.
 
     The columns are `COLUMNS`, as in the logs of the laps recorded in TORCS.
     """

@@ -17,9 +17,9 @@ def watch(
     """Serve the page at port `config.watch`; yield a function that shows the present state of
     `world` and a perceived road.
 
-    The function is called once for each control step and keeps the drive in real time.
-    `lane_centre` is the line to follow, m left of the track's centre. Raises UserError when the
-    port is in use.
+    The function is called once for each control step. It keeps the drive in real time, unless
+    `config.realtime` does so already. `lane_centre` is the line to follow, m left of the track's
+    centre. Raises UserError when the port is in use.
     """
     # A drive on the wall clock is in real time already.
     speed = None if config.realtime else 1.0

@@ -5,11 +5,11 @@ Control", 2.2). Its state is (e, theta, vy, r, kappa): offset from the line (m, 
 heading error (rad, counter-clockwise), lateral speed (m/s), yaw rate (rad/s) and the curvature of
 the road (1/m), which is modelled as a random walk.
 
-A perception measures e and theta, possibly late; the car measures vy and r in time. The filter
-estimates the state at the moment of the image, and predicts it to the present with the car's
-measurements and the steering of the steps between (the Smith predictor of a known delay). The delay
-is estimated (`controllers.laws.delay`). The variance of the measurements' noise is estimated from
-their third differences, in which motion nearly cancels and noise does not.
+A perception measures e and theta, possibly late; the car measures vy and r without delay. The
+filter estimates the state at the moment of the image, and predicts this state to the present with
+the car's measurements and the steering since the image (the Smith predictor of a known delay). The
+delay is estimated (`controllers.laws.delay`). The variance of the measurements' noise is estimated
+from their third differences, in which motion nearly cancels and noise does not.
 """
 
 import math

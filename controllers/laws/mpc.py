@@ -160,8 +160,8 @@ def plan_cost(
 ) -> float:
     """Return the cost of `plan` (n,), the wheel angles (rad) that lead to `states` (n + 1, 2).
 
-    `curvature` (1/m) is the reference's; `cost` (3,) has the weights of offset, heading and wheel
-    angle.
+    `curvature` (1/m) is the curvature of the reference; `cost` (3,) has the weights of offset,
+    heading and wheel angle.
     """
     total = 0.0
     for k in range(len(plan)):

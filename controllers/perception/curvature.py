@@ -15,8 +15,8 @@ LEFT, RIGHT = int(RoadClass.LEFT), int(RoadClass.RIGHT)
 def next_curvature(
     value: float, yaw_rate: float, vx: float, heading: float, dt: float, filter_s: float
 ) -> float:
-    """Return the estimated curvature of the road (1/m, left positive) after a control step of `dt`
-    s.
+    """Return the estimated curvature (1/m, left positive) of the road after a control step of
+    `dt` s.
 
     `value` is the estimate before the step. The estimate is `yaw_rate` (rad/s) over `vx` (m/s, at
     least 3), low-pass filtered with the time constant `filter_s` (s). It is not negative where the

@@ -169,7 +169,7 @@ class LatePerception(Generic[World]):
 
     The latency is rounded up to control steps, because a controller uses an answer at its next
     step. `predict=False` returns the late answers without prediction. Raises UserError for a
-    latency outside 0 to 1 s, and for a share below 0 or not below 1.
+    latency outside 0 to 1 s, and for a share that is negative or at least 1.
     """
 
     def __init__(

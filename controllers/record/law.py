@@ -52,8 +52,8 @@ class PerceivedLaw:
         """Return the steering action in [-1, 1] towards a path, which is `offset` m left of the
         middle of the road and turned by `path_angle` rad to the left of the road.
 
-        The path's `curvature` is not used. `state` is the true state, of which only the car's own
-        speeds and yaw rate and the lane that it is in are used.
+        The path's `curvature` is not used. Of the true `state`, only the speeds, the yaw rate and
+        the lane are used.
         """
         perceived = self._perceive(self._world)
         error = None

@@ -66,8 +66,9 @@ class Cars:
     """N cars on `tracks` (N names). The cars whose element of `disturbed` (N,) is True get new
     random parameters, noise and delay in each episode.
 
-    `starts`: fixed values or ranges of the start, for the environment's reset, by name. `episode`:
-    least and greatest number of steps of an episode. `half_width_m`: divisor of the lateral offset.
+    `starts`: values of the start by name, each fixed or a range, for the environment's reset.
+    `episode`: least and greatest number of steps of an episode. `half_width_m`: divisor of the
+    lateral offset.
     """
 
     def __init__(

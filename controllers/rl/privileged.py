@@ -57,8 +57,8 @@ def privileged_state(
     delay: NDArray[np.int64],
     noise: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the privileged states (N, 21) of the cars of `fleet`: the numbers PARTS, each divided
-    by its typical size.
+    """Return the privileged states (N, 21) of the cars of `fleet`: the numbers that `PARTS` names,
+    each divided by its typical size.
 
     The arguments are arrays (N,): `throttle` in [0, 1], `delay` in control steps, and `noise`, the
     standard deviation of the perception's noise as a share of its largest value.

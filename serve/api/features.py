@@ -114,8 +114,8 @@ class FrameHandler:
     ) -> list[int] | None:
         """Queue the image file in `body`; `on_result` is called with its result or an error.
 
-        Returns [left, top, width, height] in px of the used part of the image, or None as
-        `ImageCamera.crop_px`. Raises Problem, ImageError.
+        Returns [left, top, width, height] in px of the used part of the image, or None (see
+        `ImageCamera.crop_px`). Raises Problem, ImageError.
         """
         self.queue.check_ready()
         camera, source = self.queue.loaded.engine.card.camera, self.image_camera(options)
