@@ -10,7 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulator.link.sync.seqlock import DAMAGED, NOTHING, READ, checksum, publish, try_read
+from simulator.link import channel
+from simulator.link.client import Link
+from simulator.link.sync.seqlock import (
+    DAMAGED,
+    NOTHING,
+    READ,
+    TORN,
+    checksum,
+    publish,
+    try_read,
+)
+from simulator.vehicle.state import Command
+from tests.simulator.link.conftest import START_S
 
 BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "link.py"
 WORDS, PICTURE = 12, 5
@@ -69,6 +81,27 @@ def test_checksum_detects_any_changed_word() -> None:
         block.write(7)
         block.shared[word] ^= np.uint64(1 << 40)
         assert block.read()[0] == DAMAGED
+
+
+def test_the_latest_message_is_read_again_after_a_torn_copy(
+    oval: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcomes = [TORN, TORN]
+
+    def torn_twice(sequence: Any, shared: Any, local: Any, *rest: Any) -> Any:
+        if not outcomes:
+            return try_read(sequence, shared, local, rest[0], rest[1], 0)
+        local[1:] = 2**63
+        return outcomes.pop(), int(rest[-1])
+
+    with Link(oval, wait_s=START_S) as link:
+        link.reset(seed=1)
+        before = link.step(Command(throttle=0.5))
+        monkeypatch.setattr(channel, "try_read", torn_twice)
+        latest = link.latest()
+        assert not outcomes
+        monkeypatch.setattr(channel, "try_read", try_read)
+        assert latest.state == before.state
 
 
 def test_the_sequence_wraps_around() -> None:

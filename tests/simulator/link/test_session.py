@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Any
 
 import pytest
 
-from simulator.link import channel
 from simulator.link.client import Link
 from simulator.link.config import LinkConfig
 from simulator.link.errors import (
@@ -29,7 +27,6 @@ from simulator.link.errors import (
 from simulator.link.layout import Mode, Refusal
 from simulator.link.process import run
 from simulator.link.server import Summary
-from simulator.link.sync.seqlock import TORN, try_read
 from simulator.vehicle.state import Command
 from tests.typed import error_line, typed
 
@@ -82,27 +79,6 @@ def test_a_bad_command_is_refused_and_the_car_is_unchanged(
         assert refusal.value.code == Refusal.BAD_COMMAND
         assert link.latest().state == before.state
         assert link.step(Command(throttle=0.5)).step == 2
-
-
-def test_the_latest_message_is_read_again_after_a_torn_copy(
-    oval: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    outcomes = [TORN, TORN]
-
-    def torn_twice(sequence: Any, shared: Any, local: Any, *rest: Any) -> Any:
-        if not outcomes:
-            return try_read(sequence, shared, local, rest[0], rest[1], 0)
-        local[1:] = 2**63
-        return outcomes.pop(), int(rest[-1])
-
-    with Link(oval, wait_s=WAIT_S) as link:
-        link.reset(seed=1)
-        before = link.step(Command(throttle=0.5))
-        monkeypatch.setattr(channel, "try_read", torn_twice)
-        latest = link.latest()
-        assert not outcomes
-        monkeypatch.setattr(channel, "try_read", try_read)
-        assert latest.state == before.state
 
 
 def test_values_beyond_a_bound_by_the_rounding_of_float32_are_clipped(oval: str) -> None:
