@@ -116,7 +116,8 @@ def split(
     near: Annotated[
         str,
         typer.Option(
-            help="Tolerances of near-duplicates: m along the road, m across it, deg of yaw."
+            help="Two frames are near-duplicates if they differ by at most these values: m along "
+            "the road, m across it, deg of yaw."
         ),
     ] = "0.5,0.1,0.5",
     as_json: AsJson = False,

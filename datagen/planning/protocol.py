@@ -35,7 +35,8 @@ SPEED_KMH = 65.0  # the paper's vehicles drive at 60 to 75 km/h
 
 
 def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
-    """Make the plan: first the rounds on the nine tracks, then the four drives.
+    """Make the plan: first the rounds on the paper's nine tracks, then its drives on g-track-3 and
+    dirt-3, each in clear light and in heavy shadow.
 
     Raises UnknownTrack if a track of TORCS is not found.
     """

@@ -34,7 +34,7 @@ class CalibrateConfig:
     camera: Annotated[
         Path | None,
         Option(
-            help="Camera file with the lens, for example as calibrated with a board.",
+            help="Camera file that contains the lens, for example from a calibration with a board.",
             show_default="none",
         ),
     ] = None

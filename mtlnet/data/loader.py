@@ -78,8 +78,8 @@ class AheadLabels(Protocol):
 
 @dataclass(frozen=True)
 class Batch:
-    """A batch: `images` uint8 (B, H, W, 3), coded targets `coded` (B, 6), classes `heading` (B,),
-    and labels of the road ahead `ahead` (B, A)."""
+    """Images uint8 (B, H, W, 3) with their labels: the coded distances and angle `coded` (B, 6),
+    the `RoadClass` numbers `heading` (B,), and the labels of the auxiliary heads `ahead`."""
 
     images: NDArray[np.uint8]
     coded: NDArray[np.float32]

@@ -184,8 +184,8 @@ def single_options(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
 
 
 def merge_options(headers: Headers, options: Mapping[str, Any], where: str) -> Headers:
-    """Return `headers` with the `options` found in `where` (a query, or `parameters`) added as
-    headers.
+    """Return `headers` with the `options` of a query or of a JSON object added as headers.
+    Error messages name this source with the words `where`.
 
     Raises Problem for an option that is unknown, is also a header, or has the wrong type.
     """

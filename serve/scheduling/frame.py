@@ -29,11 +29,11 @@ class FrameResult:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image to process. Times are in ns of the monotonic clock.
+    """An image to process. `stamp_ns` and `deadline_ns` are in ns of the monotonic clock.
 
-    `stream` is 0 for a frame without a stream. A `small` image is decoded in less time than the
-    engine takes; `cost_ms` is the estimated decoding time. `source` is the image's camera if
-    its pixels are warped into the view of the model's camera.
+    `stream` is 0 for a frame without a stream. `cost_ms` is the estimated decoding time in ms; for
+    a `small` image it is shorter than the forward pass of the network. `source` is the image's
+    camera if its pixels are warped into the view of the model's camera.
     """
 
     read: PixelReader

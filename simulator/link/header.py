@@ -9,7 +9,7 @@ from simulator.link.layout import Block, Field
 
 
 def c_header() -> str:
-    """Return the text of the complete header."""
+    """Return the text of `driverview_link.h`, with which a C program connects to a link server."""
     parts = [_read("top.h"), _constants(), *(_enumeration(kind) for kind in layout.ENUMS)]
     parts.append(_read("assert.h"))
     parts += [_struct(block) for block in layout.BLOCKS]

@@ -178,7 +178,12 @@ def add_underbody_contact(
 def accelerate(
     p: Any, axes: FloatArray, wrench: FloatArray, dt: float, velocity: FloatArray
 ) -> None:
-    """Add to `velocity` its change under `wrench` over `dt` s, without gyroscopic terms."""
+    """Add the change of velocity over `dt` s to `velocity` (6,), without gyroscopic terms.
+
+    `wrench` (6,) is the force (N) and the torque (N m), `velocity` the velocity (m/s) and the
+    angular velocity (rad/s), all in the world frame. `axes` (3, 3) has the body axes as rows, and
+    `p` the car's parameters, with the moments of inertia about these axes.
+    """
     for i in range(3):
         velocity[i] += dt * wrench[i] / p.total_mass
     for i in range(3):

@@ -168,7 +168,8 @@ class World:
         return self.state
 
     def begin(self) -> None:
-        """Begin a control step: move the traffic, and set SKIPPED if a wreck is moving."""
+        """Begin a control step: move the traffic. If a car that was hit is still moving, mark this
+        car in the fleet's column SKIPPED, so that the compiled step does not move it."""
         self._row[TOUCHED] = self._row[DONE] = self._row[SKIPPED] = 0.0
         if self._traffic_count:
             self._advance_traffic(self.state)

@@ -32,7 +32,9 @@ def command(*arguments: str) -> Any:
 @pytest.mark.extended
 def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
-    options = "--rounds 1 --frames 300 --tracks oval --lanes 1 --lights clear --seed 3 --workers 1"
+    # Several sceneries: the drive below shows another one, which must not be out of distribution.
+    options = "--rounds 1 --frames 300 --tracks oval --lanes 1 --lights clear --stretch 20"
+    options += " --scenes 6 --seed 3 --workers 1"
     collected = command("datagen", "collect", *options.split(), "--out", data, "--json")
     assert (collected["rounds"], collected["frames"]) == (1, 300)
     verified = command("datagen", "verify", data, "--level", "deep", "--json")
@@ -40,7 +42,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     assert {name: verified[name] for name in expected} == expected
 
     train = ("mtlnet", "train", "--data", data, "--out", run, "--alpha", "0.3,0.2,0.5")
-    command(*train, "--recipe", "fast", "--iterations", "120")
+    command(*train, "--recipe", "fast", "--iterations", "300")
     evaluated = command(
         "mtlnet", "evaluate", "--model", run, "--data", data, "--split", "all", "--json"
     )
@@ -70,7 +72,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     rows = log.read_text().splitlines()
     assert drive["ended"] is None
     assert drive["steps"] == len(rows) - 1 == 400
-    assert drive["distance_m"] > 100
+    assert drive["distance_m"] > 100, str(drive)
     assert drive["mean_abs_d_m"] < 0.3
     assert drive["max_abs_d_m"] < 0.8
     steering = {row.split(",")[8] for row in rows[1:]}
