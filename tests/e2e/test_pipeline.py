@@ -32,9 +32,10 @@ def command(*arguments: str) -> Any:
 @pytest.mark.extended
 def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
-    # Several sceneries: the drive below shows another one, which must not be out of distribution.
-    options = "--rounds 1 --frames 300 --tracks oval --lanes 1 --lights clear --stretch 20"
-    options += " --scenes 6 --seed 3 --workers 1"
+    # 4 Hz and six sceneries: the drive below passes other places in another scenery, which must
+    # not be out of distribution for the model.
+    options = "--rounds 1 --frames 300 --tracks oval --lanes 1 --lights clear --frequency 4"
+    options += " --stretch 20 --scenes 6 --seed 3 --workers 1"
     collected = command("datagen", "collect", *options.split(), "--out", data, "--json")
     assert (collected["rounds"], collected["frames"]) == (1, 300)
     verified = command("datagen", "verify", data, "--level", "deep", "--json")
@@ -42,7 +43,7 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     assert {name: verified[name] for name in expected} == expected
 
     train = ("mtlnet", "train", "--data", data, "--out", run, "--alpha", "0.3,0.2,0.5")
-    command(*train, "--recipe", "fast", "--iterations", "300")
+    command(*train, "--recipe", "fast", "--iterations", "120")
     evaluated = command(
         "mtlnet", "evaluate", "--model", run, "--data", data, "--split", "all", "--json"
     )
@@ -72,7 +73,8 @@ def test_collect_train_evaluate_serve_and_drive(tmp_path: Path) -> None:
     rows = log.read_text().splitlines()
     assert drive["ended"] is None
     assert drive["steps"] == len(rows) - 1 == 400
-    assert drive["distance_m"] > 100, str(drive)
+    assert drive["distance_m"] > 100
+    assert drive["slowed_steps"] == 0
     assert drive["mean_abs_d_m"] < 0.3
     assert drive["max_abs_d_m"] < 0.8
     steering = {row.split(",")[8] for row in rows[1:]}
