@@ -48,7 +48,7 @@ from trackfeatures import RoadClass
 from trackfeatures.errors import UserError
 
 SHA_256 = {
-    "rl": "33d98b753bfbe911fe3afa39c04f11734001084d5d67e9764dc8249816711d19",
+    "rl": "b11940a2a1735817b3ba6053f0393ed44afcae687f189351fca6357391c663ad",
     "rl-residual": "e7c30c5a1f0bc12b982b5a29b7ba8ad2f41a1c07b06243328d7922453dafffd3",
 }
 BOUNDS_M = {"rl": 0.5, "rl-residual": 0.5}
