@@ -82,7 +82,7 @@ def test_the_help_of_drive_names_every_light_and_every_default() -> None:
     assert all(kind in shown for kind in KINDS)
     # Rich drops text in square brackets, which these sentences must not have.
     assert "Default: the paper's number on its tracks, about a lap on other tracks." in shown
-    assert "Default: 0.2, unless --speed is given." in shown
+    assert "Default: 0.2. Not with --speed" in shown
 
 
 @pytest.mark.parametrize(
