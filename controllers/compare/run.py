@@ -8,10 +8,10 @@ only if its controller, tuned parameters, road or model has changed.
 
 import hashlib
 import json
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -278,13 +278,13 @@ def _model_of(config: CompareConfig, perception: str) -> str:
 def _files_of(controller: str) -> list[Path]:
     """Paths of a controller's module, or of the file with a user's class, and of its weights."""
     if controller in CONTROLLERS:
-        module = sys.modules[CONTROLLERS[controller].factory.partition(":")[0]]
+        module = CONTROLLERS[controller].factory.partition(":")[0]
         weights = SHIPPED / controller / WEIGHTS
-        return [Path(str(module.__file__)), *filter(Path.is_file, [weights])]
+        return [Path(str(import_module(module).__file__)), *filter(Path.is_file, [weights])]
     if is_actor(Path(controller)):
         return [Path(controller) / WEIGHTS]
     place = controller.rpartition(":")[0]
-    return [Path(place if place.endswith(".py") else str(sys.modules[place].__file__))]
+    return [Path(place if place.endswith(".py") else str(import_module(place).__file__))]
 
 
 def model_hash(run: str) -> str:

@@ -155,8 +155,7 @@ class World:
         return self.state
 
     def step(self, command: Command) -> CarState:
-        """Return the state after a control step with `command`. Raises UserError for a bad
-        command."""
+        """Return the state after a control step. Raises UserError for an invalid `command`."""
         if not self._started:
             return self.state  # raises
         _fill_controls(command, self._controls)
@@ -168,8 +167,8 @@ class World:
         return self.state
 
     def begin(self) -> None:
-        """Begin a control step: move the traffic. If a car that was hit is still moving, mark this
-        car in the fleet's column SKIPPED, so that the compiled step does not move it."""
+        """Begin a control step: move the traffic. If a car that was hit is still moving, set this
+        car's value in the fleet's column SKIPPED: the compiled step then leaves this car alone."""
         self._row[TOUCHED] = self._row[DONE] = self._row[SKIPPED] = 0.0
         if self._traffic_count:
             self._advance_traffic(self.state)
