@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -55,7 +56,8 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
     """
     plan = _merge_plans([_read_plan(folder) for folder in folders], folders)
     if (out / PLAN_FILE).is_file():
-        _require_one_plan([plan, _read_plan(out)], [folders[0], out])
+        if _read_plan(out)["hash"] != plan["hash"]:
+            raise DatasetError(f"{out} was begun with other folders; choose another --out")
     elif out.exists() and not (out.is_dir() and is_unstarted(out, PLAN_FILE)):
         raise DatasetError(f"{out} exists and is not a dataset; choose another --out")
     out.mkdir(parents=True, exist_ok=True)
@@ -131,8 +133,20 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
         return plans[0]
     parts = dict(sorted(parts.items()))
     entries = [entry for plan in parts.values() for entry in plan["rounds"]]
-    if any(len({e[name] for e in entries}) < len(entries) for name in ("id", "seed")):
-        _require_one_plan(plans, folders)
+    for name, option in (("id", "--prefix"), ("seed", "--seed")):
+        value, times = Counter(entry[name] for entry in entries).most_common(1)[0]
+        if times > 1:
+            of = zip(plans, folders, strict=False)
+            holders = {
+                plan["hash"]: str(folder)
+                for plan, folder in of
+                if any(entry[name] == value for entry in plan["rounds"])
+            }
+            raise DatasetError(
+                f"{' and '.join(holders.values())} have different plans, each with a round of the "
+                f"{name} {value}; merge shards that were started with the same options, or collect "
+                f"one of the datasets with another {option}"
+            )
     drivers = {tuple(plan["driver"].values()) for plan in parts.values() if "driver" in plan}
     joined = {"driver": {"drivers": "; ".join(", ".join(d) for d in sorted(drivers))}}
     return {
@@ -143,15 +157,6 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
         **(joined if drivers else {}),
         "rounds": entries,
     }
-
-
-def _require_one_plan(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> None:
-    for plan, folder in zip(plans, folders, strict=False):
-        if plan["hash"] != plans[0]["hash"]:
-            raise DatasetError(
-                f"{folder} was begun with another plan than {folders[0]}; merge shards that were "
-                "started with the same options, or collections of another --prefix and --seed"
-            )
 
 
 def _copy_round(folder: Path, state: RoundState, out: Path) -> None:

@@ -105,8 +105,11 @@ def test_collections_of_another_prefix_and_seed_are_one_plan(tmp_path: Path) -> 
         merge([tmp_path / "a" / "1", tmp_path / "b" / "2"], tmp_path / "both")
     entries = json.loads((tmp_path / "both" / "plan.json").read_text())["rounds"]
     assert sorted(entry["id"] for entry in entries) == ["a-000", "a-001", "b-000", "b-001"]
-    with pytest.raises(DatasetError, match="another --prefix and --seed"):
-        merge([tmp_path / "a" / "1", tmp_path / "a" / "3"], tmp_path / "same")
+    folders = [tmp_path / "b" / "2", tmp_path / "a" / "1", tmp_path / "a" / "3"]
+    with pytest.raises(DatasetError, match="a/1 and .*a/3 .*id a-000;.* another --prefix"):
+        merge(folders, tmp_path / "same")
+    with pytest.raises(DatasetError, match="was begun with other folders"):
+        merge(folders[:1], tmp_path / "both")
     with pytest.raises(tf.UserError, match="prefix of the rounds' names"):
         CollectConfig(prefix="../a", tracks=tracks)
 
@@ -119,7 +122,7 @@ def test_merge_refuses_folders_of_other_plans_and_damaged_rounds(
     (other := tmp_path / "other").mkdir()
     plan = json.loads((whole / "plan.json").read_text()) | {"hash": "0" * 64}
     (other / "plan.json").write_text(json.dumps(plan))
-    assert "another plan" in refused("merge", whole, other, "--out", new)
+    assert "have different plans" in refused("merge", whole, other, "--out", new)
     assert not new.exists()
     damaged = part / "rounds" / "round-001.mcap"
     content = bytearray(damaged.read_bytes())
