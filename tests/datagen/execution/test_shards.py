@@ -106,7 +106,7 @@ def test_collections_of_another_prefix_and_seed_are_one_plan(tmp_path: Path) -> 
     entries = json.loads((tmp_path / "both" / "plan.json").read_text())["rounds"]
     assert sorted(entry["id"] for entry in entries) == ["a-000", "a-001", "b-000", "b-001"]
     folders = [tmp_path / "b" / "2", tmp_path / "a" / "1", tmp_path / "a" / "3"]
-    with pytest.raises(DatasetError, match="a/1 and .*a/3 .*id a-000;.* another --prefix"):
+    with pytest.raises(DatasetError, match=r"a/1 and .*a/3 .*id a-000;.* another --prefix"):
         merge(folders, tmp_path / "same")
     with pytest.raises(DatasetError, match="was begun with other folders"):
         merge(folders[:1], tmp_path / "both")
