@@ -33,6 +33,13 @@ THROTTLES = (THROTTLE, 0.3)
 alpine-2."""
 DELAYS = 3
 """The perception of a disturbed car is 0 to DELAYS - 1 steps (of 50 ms) late."""
+IMAGE_ERRORS = (0.022, 0.009)
+"""Standard deviations (m, rad) of the errors of offset and angle in the model's answers during a
+drive on images (docs/experiments/controllers.md). Unlike the noise of a disturbed car, they last
+for several steps."""
+IMAGE_ERROR_KEPT, IMAGE_ERROR_CORRELATION = 0.85, 0.6
+"""Correlation of the errors on images with the errors one step earlier, and of the offset's error
+with the angle's error."""
 PERCEIVED = (0, 1, 4, 5, 6)
 """Indices of the numbers in the paper's state that the perception measures. The car's speeds are
 measured without delay."""
@@ -68,7 +75,8 @@ class Cars:
 
     `starts`: values of the start by name, each fixed or a range, for the environment's reset.
     `episode`: least and greatest number of steps of an episode. `half_width_m`: divisor of the
-    lateral offset.
+    lateral offset. `image_errors`: the states of all cars that are not disturbed have errors like
+    those of the model on images (`IMAGE_ERRORS`).
     """
 
     def __init__(
@@ -82,6 +90,7 @@ class Cars:
         half_width_m: float,
         reward: str = "paper",
         state_noise: float = 0.0,
+        image_errors: bool = False,
         threads: int = 1,
         tracks_dir: Path | None = None,
     ) -> None:
@@ -90,6 +99,7 @@ class Cars:
         self._disturbed, self._episode = disturbed, episode
         self._half_width_m, self._quadratic = half_width_m, reward == "quadratic"
         self._state_noise = state_noise
+        self._on_images = ~disturbed if image_errors else np.zeros(self.count, np.bool_)
         drawn: dict[str, Any] = {
             name: [range_ if one else 1.0 for one in disturbed.tolist()]
             for name, range_ in (("friction", FRICTION), ("mass", MASS))
@@ -110,6 +120,7 @@ class Cars:
         self._left = np.zeros(self.count, np.int64)
         self._delay = np.zeros(self.count, np.int64)
         self._noise = np.zeros(self.count)
+        self._image_errors = np.zeros((self.count, 2), np.float32)
         self._late = np.zeros((DELAYS, self.count, STATE_SIZE), np.float32)
         self._recent = np.zeros((self.count, HISTORY_STEPS, STATE_SIZE), np.float32)
         self._everyone = np.ones(self.count, np.bool_)
@@ -163,7 +174,7 @@ class Cars:
         self._left = np.where(new, lengths, self._left)
         self._actions[new, 1] = np.where(of, throttles, THROTTLE)[new]
         self._delay[new] = np.where(of, delays, 0)[new]
-        self._noise[new] = np.where(of, noises, 0.0)[new]
+        self._noise[new] = np.where(of, noises, self._on_images)[new]
 
     def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
         """Return the states (N, size) with delay and noise, from the environment's observation.
@@ -182,6 +193,8 @@ class Cars:
         seen = exact
         seen[:, PERCEIVED] = self._late[self._delay, np.arange(self.count)][:, PERCEIVED]
         self._add_noise(seen)
+        if self._on_images.any():
+            seen[:, :2] += self._next_image_errors(new)
         if not self._history:
             return seen
         if new.any():
@@ -201,6 +214,20 @@ class Cars:
             )
             drawn = self._rng.standard_normal((self.count, 4), np.float32)
             seen[:, :4] += drawn * (self._noise[:, None] * spread).astype(np.float32)
+
+    def _next_image_errors(self, new: NDArray[np.bool_]) -> Array:
+        """Return the errors (N, 2) of offset and angle of this step, in the units of the state; 0
+        for cars without errors on images. Each error is a first-order autoregressive process."""
+        drawn = self._rng.standard_normal((self.count, 2), np.float32)
+        shared, kept = np.float32(IMAGE_ERROR_CORRELATION), np.float32(IMAGE_ERROR_KEPT)
+        drawn[:, 1] = shared * drawn[:, 0] + np.sqrt(1 - shared**2) * drawn[:, 1]
+        if new.any():
+            self._image_errors[new] = drawn[new]
+        else:
+            self._image_errors = kept * self._image_errors + np.sqrt(1 - kept**2) * drawn
+        unit = np.array(IMAGE_ERRORS) / (self._half_width_m, np.pi)
+        found: Array = self._image_errors * (self._on_images[:, None] * unit).astype(np.float32)
+        return found
 
 
 def random_cars(

@@ -166,6 +166,15 @@ class TrainConfig:
             max=1.0,
         ),
     ] = 0.5
+    image_errors: Annotated[
+        bool,
+        Option(
+            "--image-errors",
+            help="With several cars: the offset and the angle in the states of all cars that are "
+            "not disturbed have errors like those of the model on images, also in evaluations. "
+            "The actor then drives better on images and worse on the truth.",
+        ),
+    ] = False
     state_noise: Annotated[
         float | None,
         "Standard deviation of the noise on the paper's state. Default: "
@@ -207,8 +216,13 @@ class TrainConfig:
 
 def resolve(config: TrainConfig) -> TrainConfig:
     """Return `config` with the number of cars, the track, the steps and the steps between
-    evaluations; a missing value gets the default for one car or for several cars."""
+    evaluations; a missing value gets the default for one car or for several cars.
+
+    Raises UserError for errors of images with one car.
+    """
     many = config.vectorised
+    if config.image_errors and not many:
+        raise UserError("--image-errors needs several cars; give --envs or --algorithm ppo")
     defaults: dict[str, Any] = {
         "envs": 256 if many else 1,
         "track": ALL_TRACKS if many else "forza",

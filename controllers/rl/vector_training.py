@@ -126,6 +126,7 @@ class _Training:
         shared: dict[str, Any] = {
             "half_width_m": self._half_width_m,
             "reward": config.reward,
+            "image_errors": config.image_errors,
             "threads": config.threads,
             "tracks_dir": folder,
         }

@@ -107,6 +107,25 @@ def test_noise_has_the_spread_of_the_disturbance(nominal: pytest.MonkeyPatch) ->
     assert not errors[:, :, 2:].any()
 
 
+def test_errors_of_images_last_for_several_steps_and_spare_disturbed_cars(
+    nominal: pytest.MonkeyPatch,
+) -> None:
+    """The errors of offset and angle have their spread and correlations; they go on in an episode
+    and begin anew with the next."""
+    exact = steered(oval(1, episode=(20, 20)))
+    cars = oval(400, image_errors=True, episode=(20, 20))
+    errors = (steered(cars) - exact)[:, :, :2] * (HALF_WIDTH_M, np.pi)
+    assert errors.std(axis=(0, 1)) == pytest.approx(module.IMAGE_ERRORS, rel=0.05)
+    offset, angle = (errors / module.IMAGE_ERRORS).transpose(2, 0, 1)
+    assert (offset * angle).mean() == pytest.approx(module.IMAGE_ERROR_CORRELATION, abs=0.05)
+    kept = (offset[1:] * offset[:-1]).mean(axis=1)
+    assert kept[:19].mean() == pytest.approx(module.IMAGE_ERROR_KEPT, abs=0.05)
+    assert abs(kept[19]) < 0.2  # the first step of a new episode
+    assert not (steered(oval(2, image_errors=True)) - steered(oval(1)))[:, :, 2:].any()
+    disturbed = steered(oval(2, disturbed=True, image_errors=True))
+    np.testing.assert_array_equal(disturbed[:, 0], steered(oval(1))[:, 0])
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("FRICTION", (0.5, 0.5)), ("MASS", (1.5, 1.5)), ("THROTTLES", (0.3, 0.3))]
 )
