@@ -161,6 +161,15 @@ def test_numbers_out_of_range_are_refused(words: tuple[str, ...]) -> None:
     assert words[0] in done.stderr
 
 
+def test_errors_of_images_need_several_cars(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = typed("controllers", "train", "--image-errors", "--out", out)
+    assert error_line(done).startswith("error: --image-errors needs several cars; give --envs")
+    assert not out.exists()
+    train(short(out, image_errors=True))
+    assert json.loads((out / "config.json").read_text())["image_errors"]
+
+
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     train(short(tmp_path, steps=UPDATE))
     path = tmp_path / "checkpoint.safetensors"
