@@ -13,8 +13,8 @@ preview of the road. Deviations from the paper:
 
 On a perceived state, `Lqr` and `LqrPreview` limit the heading error at which they return to the
 line to 0.15 rad. Without the limit a start at rest 2.7 m beside the line (TORCS's starting position
-on eroad) turns the car by 0.6 rad; the shipped model answers 0.25 rad at most, and the car left the
-road.
+on eroad) turns the car by 0.6 rad. In such drives the model `default` answered no angle above 0.25
+rad, and the car left the road.
 
 `LqrPreview` (`lqr-preview`) adds a feed-forward of the curvature just ahead: a wheel angle, and the
 slip angle of a steady bend as the set point. If the curvature is not measured, it is estimated from

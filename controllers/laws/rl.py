@@ -14,7 +14,8 @@ from trackfeatures.errors import UserError
 
 FARTHEST_M = 0.8
 """Largest offset (m) that an actor receives on perception. At an offset of 1 m the shipped actor
-turns the car by 0.28 rad towards the lane, but the shipped model's angle is 0.25 rad at most."""
+turns the car by 0.28 rad towards the lane, but in drives the model `default` answered no angle
+above 0.25 rad."""
 
 
 class RlController:
