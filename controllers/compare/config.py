@@ -21,8 +21,8 @@ class CompareConfig:
     ] = "truth"
     seeds: Annotated[
         int,
-        "Number of times that each drive is repeated, with the seeds 0, 1, ... With perception "
-        "truth the seed has no effect without --disturb.",
+        "Number of times that each drive is repeated, with the seeds 0, 1, ... The seed "
+        "changes images and disturbances. Drives with neither are all equal.",
     ] = 1
     disturb: Annotated[
         bool,

@@ -73,7 +73,8 @@ def export_model(
     `--json`.
 
     `kind`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". The comparison uses `frames`
-    frames of the dataset `data`, by default the training data; for int8 they are test rounds.
+    frames of the dataset `data`, by default of the training data. For int8 it uses frames of the
+    dataset's test rounds only.
     `out`: the folder to write. Raises UserError for an unsupported export, ModelError when an f32
     export differs by more than the tolerance.
     """
