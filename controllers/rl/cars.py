@@ -213,7 +213,8 @@ class Cars:
                 *(SPEED_NOISE_M_S / SPEED_SCALE_M_S,) * 2,
             )
             drawn = self._rng.standard_normal((self.count, 4), np.float32)
-            seen[:, :4] += drawn * (self._noise[:, None] * spread).astype(np.float32)
+            shares = np.where(self._disturbed, self._noise, 0.0)
+            seen[:, :4] += drawn * (shares[:, None] * spread).astype(np.float32)
 
     def _next_image_errors(self, new: NDArray[np.bool_]) -> Array:
         """Return the errors (N, 2) of offset and angle of this step, in the units of the state; 0

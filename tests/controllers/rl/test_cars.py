@@ -126,6 +126,22 @@ def test_errors_of_images_last_for_several_steps_and_spare_disturbed_cars(
     np.testing.assert_array_equal(disturbed[:, 0], steered(oval(1))[:, 0])
 
 
+def test_the_noise_of_disturbed_cars_is_not_added_to_errors_of_images() -> None:
+    half = np.arange(400) % 2 == 0
+    cars = Cars(
+        PAPER,
+        ["oval"] * 400,
+        half,
+        starts=START,
+        episode=(100, 100),
+        half_width_m=HALF_WIDTH_M,
+        image_errors=True,
+    )
+    errors = (steered(cars) - steered(oval(1)))[:, ~half] * ([HALF_WIDTH_M, np.pi] + [1.0] * 5)
+    assert errors[:, :, :2].std(axis=(0, 1)) == pytest.approx(module.IMAGE_ERRORS, rel=0.05)
+    assert not errors[:, :, 2:].any()
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("FRICTION", (0.5, 0.5)), ("MASS", (1.5, 1.5)), ("THROTTLES", (0.3, 0.3))]
 )
