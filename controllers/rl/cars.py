@@ -161,7 +161,8 @@ class Cars:
 
     def _exact(self) -> Array:
         throttle, fleet = self._actions[:, 1], self._envs.fleet
-        return privileged_state(fleet, throttle, self._delay, self._noise)
+        noise = np.where(self._on_images, 1.0, self._noise)
+        return privileged_state(fleet, throttle, self._delay, noise)
 
     def _begin(self, new: NDArray[np.bool_]) -> None:
         """Set random throttle, delay, noise and length of the episodes of the `new` cars (N,)."""
@@ -174,7 +175,7 @@ class Cars:
         self._left = np.where(new, lengths, self._left)
         self._actions[new, 1] = np.where(of, throttles, THROTTLE)[new]
         self._delay[new] = np.where(of, delays, 0)[new]
-        self._noise[new] = np.where(of, noises, self._on_images)[new]
+        self._noise[new] = np.where(of, noises, 0.0)[new]
 
     def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
         """Return the states (N, size) with delay and noise, from the environment's observation.
@@ -213,8 +214,7 @@ class Cars:
                 *(SPEED_NOISE_M_S / SPEED_SCALE_M_S,) * 2,
             )
             drawn = self._rng.standard_normal((self.count, 4), np.float32)
-            shares = np.where(self._disturbed, self._noise, 0.0)
-            seen[:, :4] += drawn * (shares[:, None] * spread).astype(np.float32)
+            seen[:, :4] += drawn * (self._noise[:, None] * spread).astype(np.float32)
 
     def _next_image_errors(self, new: NDArray[np.bool_]) -> Array:
         """Return the errors (N, 2) of offset and angle of this step, in the units of the state; 0
