@@ -74,8 +74,8 @@ def export_model(
 
     `kind`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". The comparison uses `frames`
     frames of the dataset `data`, by default of the training data. For int8 it uses frames of the
-    dataset's test rounds only. `out`: the folder to write. Raises UserError for an unsupported export, ModelError when an f32
-    export differs by more than the tolerance.
+    dataset's test rounds only. `out`: the folder to write. Raises UserError for an unsupported
+    export, ModelError when an f32 export differs by more than the tolerance.
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
