@@ -171,8 +171,7 @@ class TrainConfig:
         Option(
             "--image-errors",
             help="With several cars: the offset and the angle in the states of all cars that are "
-            "not disturbed have errors like those of the model on images, also in evaluations. "
-            "The actor then drives better on images and worse on the truth.",
+            "not disturbed have errors like those of the model on images, also in evaluations.",
         ),
     ] = False
     state_noise: Annotated[
