@@ -23,7 +23,7 @@ from controllers.drive.closed_loop import run_lap
 from controllers.interface import Controller, LoopConfig, Observation
 from controllers.perception.sources import open_perception, truth
 from controllers.registry import make_controller
-from mtlnet.inference.model_card import SHIPPED
+from mtlnet.inference.shipped_models import SHIPPED
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World

@@ -10,18 +10,17 @@ from trackfeatures.definitions import (
     IN_LANE_MARGIN_M,
     LANE_WIDTH_M,
     LANES,
-    LOOK_AHEAD_M,
     MARKINGS,
     ON_MARKING_REACH_M,
     RANGES,
     TARGETS,
     VERSION,
     Range,
-    RoadClass,
     TrackFeatures,
     lane_offset,
 )
 from trackfeatures.errors import DefinitionsMismatch, UserError, require_version
+from trackfeatures.road_class import LOOK_AHEAD_M, RoadClass, classify_heading
 
 if TYPE_CHECKING:
     from trackfeatures.camera import CameraParameters
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from trackfeatures.measurement import (
         CentreLine,
         check_lanes,
-        classify_heading,
         lane_centre,
         lane_index,
         localise,

@@ -11,14 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trackfeatures.definitions import (
-    MARKINGS,
-    RANGES,
-    TARGETS,
-    UNKNOWN_HEADING,
-    RoadClass,
-    TrackFeatures,
-)
+from trackfeatures.definitions import MARKINGS, RANGES, TARGETS, TrackFeatures
+from trackfeatures.road_class import UNKNOWN_HEADING, RoadClass
 
 OFFSET, SPAN = 0.1, 0.8
 UNKNOWN_M: Final = math.inf

@@ -8,9 +8,10 @@ DeepDriving (Chen et al. 2015).
 """
 
 from dataclasses import dataclass
-from enum import IntEnum
 from types import MappingProxyType
 from typing import Final
+
+from trackfeatures.road_class import RoadClass
 
 VERSION: Final = "2"
 """Version of these definitions; stored in every recording, model and answer."""
@@ -32,24 +33,6 @@ ON_MARKING_REACH_M: Final = 1.2
 """The on-marking system is active within this distance of a marking."""
 OUTSIDE_REACH_M: Final = 2.0
 """Reach of the on-marking system on the outer side of an outermost marking."""
-
-BEND_CURVATURE: Final = 1.0 / 170.0
-"""Smallest curvature of a bend in 1/m; a road of lower curvature counts as straight."""
-LOOK_AHEAD_M: Final = 20.0
-"""If the road is straight at the car, its curvature this far ahead decides the class."""
-
-
-class RoadClass(IntEnum):
-    """The direction in which the road ahead bends. It is the third task of the paper's network,
-    which calls it the heading. Files, messages and answers use the name `heading`."""
-
-    LEFT = 0
-    STRAIGHT = 1
-    RIGHT = 2
-
-
-UNKNOWN_HEADING: Final = -1
-"""Value of an unlabelled class; the loss and the metrics ignore it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,18 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trackfeatures.definitions import (
-    BEND_CURVATURE,
     IN_LANE_MARGIN_M,
     LANE_WIDTH_LIMITS_M,
     LANES,
-    LOOK_AHEAD_M,
     ON_MARKING_REACH_M,
     OUTSIDE_REACH_M,
-    RoadClass,
     TrackFeatures,
     lane_offset,
 )
 from trackfeatures.errors import UserError
+from trackfeatures.road_class import LOOK_AHEAD_M, classify_heading
 
 LineOffsets = Sequence[tuple[float, float]]
 """For each marking two offsets from its nominal position in m, left positive: that of the line that
@@ -66,15 +64,6 @@ def lane_index(to_middle: float, lanes: int, lane_width_m: float) -> int:
 def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
     """Return the lateral position of the centre of lane `index` (m, left positive)."""
     return lane_width_m * (lanes / 2 - index - 0.5)
-
-
-def classify_heading(curvature: float, curvature_ahead: float) -> RoadClass:
-    """Return the class of the road from the `curvature` at the car and the `curvature_ahead`, 20 m
-    ahead of the car (1/m, left positive)."""
-    for kappa in (curvature, curvature_ahead):
-        if abs(kappa) >= BEND_CURVATURE:
-            return RoadClass.LEFT if kappa > 0 else RoadClass.RIGHT
-    return RoadClass.STRAIGHT
 
 
 def wrap_angle(angle: float) -> float:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from trackfeatures.definitions import RoadClass
+from trackfeatures.road_class import RoadClass
 
 STATE_SIZE = 7
 SPEED_SCALE_M_S = 75.0 / 3.6

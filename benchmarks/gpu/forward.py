@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from mtlnet.architecture import HEIGHT, WIDTH
-from mtlnet.inference.model_card import SHIPPED, WEIGHTS, read_card
+from mtlnet.inference.model_card import WEIGHTS, read_card
+from mtlnet.inference.shipped_models import SHIPPED
 from mtlnet.model.network import Network, load_network
 
 Pass = Callable[[], Tensor]

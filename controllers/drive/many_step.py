@@ -42,8 +42,7 @@ from simulator.world.fleet import (
     TRACK_AT,
     Arrays,
 )
-from trackfeatures.definitions import LOOK_AHEAD_M, RoadClass
-from trackfeatures.measurement import classify_heading
+from trackfeatures.road_class import LOOK_AHEAD_M, RoadClass, classify_heading
 
 # A row of `log` (LOG,): the true state before a control step, with the class of the road and the
 # curvature just ahead, and the steering action in this step.

@@ -27,7 +27,7 @@ from mtlnet.inference.model_card import CARD, read_card
 from mtlnet.training.checkpoint import FOLDER as CHECKPOINTS
 from mtlnet.training.config import CONFIG, TrainConfig
 from mtlnet.training.configure import resume_config
-from mtlnet.training.losses.alpha import Alpha
+from mtlnet.training.losses.task_weights import Alpha
 from runtime.files import atomic_write, write_json
 from trackfeatures.errors import UserError
 

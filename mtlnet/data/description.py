@@ -9,7 +9,7 @@ import trackfeatures as tf
 from datagen.recording import Dataset, Frames
 from mtlnet.data.loader import LabelArrays
 from mtlnet.inference.trained_rounds import Seeds, names_entry
-from trackfeatures.definitions import UNKNOWN_HEADING
+from trackfeatures.road_class import UNKNOWN_HEADING
 
 
 def describe_data(

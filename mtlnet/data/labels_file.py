@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 import trackfeatures as tf
 from runtime.files import atomic_write
 from trackfeatures.coding import UNKNOWN_M
-from trackfeatures.definitions import UNKNOWN_HEADING
 from trackfeatures.errors import UserError
+from trackfeatures.road_class import UNKNOWN_HEADING
 
 LABELS = "labels.csv"
 COLUMNS = ("file", *tf.MARKINGS, "angle", "heading")

@@ -17,8 +17,9 @@ import trackfeatures as tf
 from datagen.recording import Frames
 from mtlnet.data.description import nan_where_unknown
 from mtlnet.data.loader import LabelArrays
+from mtlnet.inference.out_of_distribution import is_out_of_distribution
 from mtlnet.inference.prediction import FEATURES, OUTPUTS, split_outputs
-from trackfeatures.definitions import UNKNOWN_HEADING
+from trackfeatures.road_class import UNKNOWN_HEADING
 
 PERCENTILES = {"median": 50, "p95": 95, "p99": 99}
 CALIBRATION_BINS = 10
@@ -189,7 +190,7 @@ def evaluate_outputs(
     }
     parts = split_outputs(outputs)
     if parts.std is not None and parts.ood_score is not None:
-        share = float((~(parts.ood_score <= 1)).mean())
+        share = float(is_out_of_distribution(parts.ood_score).mean())
         report["uncertainty"] = {
             "coverage": coverage(parts.std, errors),
             "out_of_distribution": share,

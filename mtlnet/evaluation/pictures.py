@@ -17,6 +17,7 @@ from mtlnet.data.custom_images import CustomImages
 from mtlnet.data.labels_file import LabelledPicture
 from mtlnet.data.picture_copies import COPIES
 from mtlnet.evaluation.metrics import coverage, evaluate_outputs, signed_errors
+from mtlnet.inference.out_of_distribution import is_out_of_distribution
 from mtlnet.inference.prediction import split_outputs
 
 FEATURES = ("ml", "mr", "lane_width", "to_lane_centre", "angle")
@@ -61,7 +62,7 @@ class Answers:
         """Mask (N,) of the pictures that the model flags as out of distribution; None for a model
         without this flag."""
         score = split_outputs(self.outputs).ood_score
-        return None if score is None else ~(score <= 1)
+        return None if score is None else is_out_of_distribution(score)
 
     @property
     def label_std(self) -> NDArray[np.float64]:

@@ -20,8 +20,8 @@ from mtlnet.evaluation.evaluate import about, predict_rounds, require_fit
 from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import FEATURES, OUTPUTS
-from trackfeatures.definitions import UNKNOWN_HEADING
 from trackfeatures.errors import UserError
+from trackfeatures.road_class import UNKNOWN_HEADING
 
 PAPER = "paper"
 INTERVALS = 4

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mtlnet.inference.shipped_models import SHIPPED, SHIPPED_FILES
 from mtlnet.inference.trained_rounds import shortened
 from runtime.files import file_hash, write_json
 from trackfeatures.camera import CameraParameters, stored
@@ -20,24 +21,8 @@ from trackfeatures.errors import UserError, require_version
 from trackfeatures.names import require_name
 
 RUNS = Path("runs")
-SHIPPED = Path(__file__).parents[1] / "weights" / "default"
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
-SHIPPED_FILES = {
-    "default": {
-        WEIGHTS: "6894e11c0211330c33c3018ce9479bcd39e5d4151237dd6a2c46c5a07e35ef8b",
-        GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
-        GRAPH_WEIGHTS: "c29fa70baad6ab421c4dcbd9d0dd9a25dfed741cf77b11d526ef2f08fbdd7208",
-        UNCERTAINTY_WEIGHTS: "3a4e5a467545445e2e87eb5b96cf414b38ed8bbaa8ceb8d384218d6f628a8717",
-    },
-    "varied": {
-        WEIGHTS: "2ac2cd4e24ae98ba6ab029cc8cd6974b95ea00313a615f9fd1e76b58e846db8e",
-        GRAPH: "2b2eab26bd9d92f02c107ac395f6a30b80355fcf23da28810af10c0185885c4b",
-        GRAPH_WEIGHTS: "ed15fca3e3c1e5f3c503dd18ec28a90c57c9fb249da7d56b78e6e88a510589dd",
-        UNCERTAINTY_WEIGHTS: "2042be0acae0688c300afcb1069cef27853c20fabd7c941e76bd6d159804ae3a",
-    },
-}
-"""SHA-256 of the files of each shipped model, by its name."""
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
 FORMAT = 6  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
 LISTING_FORMAT = 5

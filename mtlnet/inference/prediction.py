@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from mtlnet.inference.out_of_distribution import is_out_of_distribution
 
 FEATURES = (*tf.MARKINGS, "to_lane_centre", "angle")
 """Features that have a standard deviation; its unit is m, for the angle rad."""
@@ -123,11 +124,13 @@ def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
     distances, angle = tf.decode(parts.coded[None])
     decoded = [*distances[0].tolist(), *tf.localise(distances).tolist()]
     values = [None if isnan(value) else value for value in decoded]
-    std = absent = None
+    std = absent = foreign = None
     if parts.std is not None:
         present = [value is not None for value in values] + [True]  # the angle is never absent
         columns = zip(FEATURES, parts.std.tolist(), present, strict=True)
         std = {name: value if found else None for name, value, found in columns}
+    if parts.ood_score is not None:
+        foreign = bool(is_out_of_distribution(parts.ood_score))
     if parts.absent is not None:
         absent = dict(zip(tf.MARKINGS, parts.absent.tolist(), strict=True))
     return Prediction(
@@ -136,7 +139,6 @@ def decode_outputs(outputs: NDArray[np.float32]) -> Prediction:
         angle_rad=float(angle[0]),
         heading=dict(zip(ROAD_CLASSES, parts.heading.tolist(), strict=True)),
         std=std,
-        # Written so that a NaN counts as out of distribution too.
-        out_of_distribution=None if parts.ood_score is None else not parts.ood_score <= 1.0,
+        out_of_distribution=foreign,
         absent=absent,
     )

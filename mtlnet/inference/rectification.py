@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from mtlnet.inference.image_decoding.errors import Fault, ImageError
+from mtlnet.inference.out_of_distribution import HEIGHT_SCORE, is_height_seen
 from mtlnet.inference.prediction import split_outputs
 from runtime.camera_file import read_camera as read_camera  # scripts import it from here
 from trackfeatures.camera import CameraParameters
@@ -27,16 +28,10 @@ LEAST_SHOWN = 0.25
 """Minimum share of the rows, and of the columns, of the model's view that an image must show."""
 LEAST_ROAD = 0.1
 """Minimum share of the rows of the model's view below the horizon that an image must show."""
-COMMON_LANE_M = 3.6
-SEEN_LANES_M = (2.75, 4.4)
-"""Range of lane widths in training, m at the model's camera. A camera is out of distribution if its
-height makes a lane of `COMMON_LANE_M` look wider or narrower than this range."""
 BORDER_LEVEL = 128
 """Grey level of areas that an image does not show. The network's normalisation makes it almost 0,
 like the padding of convolutions."""
 TOLERANCE = 0.01
-HEIGHT_SCORE = 2.0
-"""Minimum `ood_score` of an image of a camera that is too high or too low."""
 OUTSIDE = -1e4  # outside every image, px
 KEPT_MAPS = 16
 
@@ -140,8 +135,8 @@ class Rectification:
         Distances and their standard deviations change; the standard deviations then include the
         uncertainty of the source's height. Absent distances stay absent. The angle does not change,
         because the rectified view looks along the car. If the camera is too high or too low
-        (`SEEN_LANES_M`), all images are marked as out of distribution. `split_outputs` explains the
-        K columns.
+        (`is_height_seen`), all images are marked as out of distribution. `split_outputs` explains
+        the K columns.
         """
         changed = outputs.copy()
         parts = split_outputs(changed)
@@ -157,9 +152,7 @@ class Rectification:
             )
             own = self.scale * parts.std[:, :-1]
             parts.std[:, :-1] = np.hypot(own, np.nan_to_num(from_height))
-        narrowest, widest = SEEN_LANES_M
-        seen = self.any_height or narrowest <= COMMON_LANE_M / self.scale <= widest
-        if parts.ood_score is not None and not seen:
+        if parts.ood_score is not None and not (self.any_height or is_height_seen(self.scale)):
             parts.ood_score[:] = np.maximum(parts.ood_score, HEIGHT_SCORE)
         return changed
 

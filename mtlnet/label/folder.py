@@ -28,8 +28,8 @@ from mtlnet.sources.kinds import SourceKind, kind_of
 from runtime.camera_file import write_camera
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
-from trackfeatures.definitions import BEND_CURVATURE
 from trackfeatures.errors import UserError
+from trackfeatures.road_class import BEND_CURVATURE
 
 KEPT = ("drive", "light", "camera", "std_m", "std_rad")
 """Columns whose values stay when a label is saved, unless the page sends new ones."""

@@ -29,8 +29,8 @@ from mtlnet.data.labels_file import (
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from runtime.camera_file import write_camera
 from trackfeatures.camera import CameraParameters
-from trackfeatures.definitions import BEND_CURVATURE
 from trackfeatures.errors import UserError
+from trackfeatures.road_class import BEND_CURVATURE
 
 NEEDED = ("file", "x_left_m", "x_right_m", "heading_rad", "fov_y_deg", "camera_height_m")
 CAMERAS = "cameras"

@@ -11,7 +11,7 @@ from typing import Annotated
 from typer import Option
 
 from mtlnet.architecture import find_architecture, require_task_heads
-from mtlnet.training.losses.alpha import Alpha, parse_alpha, require_method
+from mtlnet.training.losses.task_weights import Alpha, parse_alpha, require_method
 from mtlnet.training.recipes import find_recipe
 from trackfeatures.errors import UserError
 

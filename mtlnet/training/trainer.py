@@ -15,10 +15,10 @@ from mtlnet.model.cpu_kernels.forward import FAST, forward_grid, forward_shared,
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.cuda_graph import CudaGraphStep, CudaRecorder
 from mtlnet.training.distributed import SINGLE_PROCESS, Rank, average, dropout_seed
-from mtlnet.training.losses.alpha import Alpha
 from mtlnet.training.losses.bins import bins_loss
 from mtlnet.training.losses.multi_task import Losses, multi_task_loss
 from mtlnet.training.losses.task_weighting import TaskWeighting
+from mtlnet.training.losses.task_weights import Alpha
 from mtlnet.training.optimizers import OptimizerSet
 from mtlnet.training.recipes import Recipe, frozen_convolutions, learning_rate
 from runtime.processor import has_bf16

@@ -18,18 +18,18 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from functools import lru_cache, partial
+from functools import partial
 from queue import SimpleQueue
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
-from serve.problems import DEADLINE_PASSED, NOT_READY, OVERLOADED, SUPERSEDED, Problem
-from serve.scheduling.admission import Admission
+from serve.problems import DEADLINE_PASSED, NOT_READY, SUPERSEDED, Problem
 from serve.scheduling.fair_queue import FairQueue, Slot
 from serve.scheduling.frame import Frame, FrameResult, ResultCallback
 from serve.scheduling.loaded_engine import LoadedEngine, StagedEngine
+from serve.scheduling.overload import Admission, queue_full, shared_queue_full
 from serve.scheduling.streams import StreamTable
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
@@ -155,7 +155,7 @@ class FrameQueue:
         with self._queue_lock:
             if self._waiting.giving_way_to(client) is not None:
                 return None
-        return _shared_overloaded(*self._load())
+        return shared_queue_full(*self._load())
 
     def submit(self, frame: Frame, on_result: ResultCallback) -> None:
         """Queue a frame; `on_result` is called on the loop with its result or its error.
@@ -203,13 +203,13 @@ class FrameQueue:
             if last is not None:
                 self._waiting.remove(last)
             elif self.full:
-                raise _overloaded(*self._load())
+                raise queue_full(*self._load())
             self._waiting.append(slot)
             if not self._dispatched:
                 self._dispatched = True
                 # Later, so that the loop first reads all requests that have arrived.
                 self._loop.call_soon(self._dispatch)
-            return None if last is None else partial(last.on_result, _overloaded(*self._load()))
+            return None if last is None else partial(last.on_result, queue_full(*self._load()))
 
     def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
         """Put a frame into its stream's slot, unless a newer frame is in it.
@@ -315,15 +315,3 @@ class FrameQueue:
         for frames_wait in (True, False):
             self._wake_ups.put(frames_wait)
         self._thread.join()
-
-
-def _overloaded(waiting: int, wait_ms: int) -> Problem:
-    return Problem(
-        OVERLOADED,
-        f"{waiting} frames are waiting; send this frame or a newer one later, or start the "
-        "service with more --workers",
-        wait_ms,
-    )
-
-
-_shared_overloaded = lru_cache(64)(_overloaded)

@@ -41,14 +41,14 @@ from simulator.world.fleet import (
     Arrays,
 )
 from simulator.world.world import BACKWARDS_SPEED_M_S
-from trackfeatures.definitions import LOOK_AHEAD_M, lane_offset
+from trackfeatures.definitions import lane_offset
 from trackfeatures.measurement import (
-    classify_heading,
     in_lane_distances,
     lane_centre,
     lane_index,
     on_marking_distances,
 )
+from trackfeatures.road_class import LOOK_AHEAD_M, classify_heading
 from trackfeatures.state_vector import STATE_SIZE, state_vector
 
 for function in (

@@ -17,8 +17,8 @@ from runtime.files import atomic_write, check_folder
 from simulator.arrays import FloatArray
 from simulator.track.geometry import Track, TrackPose
 from simulator.track.road import Road
-from trackfeatures.definitions import BEND_CURVATURE
 from trackfeatures.errors import UserError
+from trackfeatures.road_class import BEND_CURVATURE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -26,20 +26,15 @@ from mtlnet.data.labels_file import COLUMNS
 from mtlnet.evaluation.protocol import drive_rows
 from mtlnet.inference.engine import Engine, load_engine
 from mtlnet.inference.image_decoding.decode import crop_and_resize, read_header, read_whole_image
-from mtlnet.inference.model_card import (
-    SHIPPED,
-    UNCERTAINTY_WEIGHTS,
-    WEIGHTS,
-    read_card,
-    resolve_run,
-)
+from mtlnet.inference.model_card import UNCERTAINTY_WEIGHTS, WEIGHTS, read_card, resolve_run
 from mtlnet.inference.rectification import Rectification
+from mtlnet.inference.shipped_models import SHIPPED
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import fit_markings
 from mtlnet.label.import_table import import_labels
 from mtlnet.predict.run import predict_files
 from mtlnet.sources.films import Film, read_film_header
-from mtlnet.training.losses.alpha import parse_alpha
+from mtlnet.training.losses.task_weights import parse_alpha
 from runtime.camera_file import read_camera
 from serve.cameras import read_cameras
 from tests.docs.attempts import Try, add_to, written

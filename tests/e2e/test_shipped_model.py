@@ -9,7 +9,8 @@ import pytest
 
 from mtlnet.export.ship import write_page
 from mtlnet.inference.engine import INT8, int8_graph, load_engine, read_export
-from mtlnet.inference.model_card import SHIPPED, SHIPPED_FILES, ModelError, read_card, resolve_run
+from mtlnet.inference.model_card import ModelError, read_card, resolve_run
+from mtlnet.inference.shipped_models import SHIPPED, SHIPPED_FILES
 from mtlnet.inference.trained_rounds import Seeds
 from runtime.files import file_hash
 from runtime.processor import has_int8

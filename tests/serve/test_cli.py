@@ -18,8 +18,9 @@ from typing import Any
 
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.golden_image import golden_image
-from mtlnet.inference.model_card import CARD, SHIPPED, read_card
+from mtlnet.inference.model_card import CARD, read_card
 from mtlnet.inference.prediction import decode_outputs
+from mtlnet.inference.shipped_models import SHIPPED
 from runtime.sockets import bind
 from serve.client import Client
 from serve.worker import SupervisorConnection, send_ready

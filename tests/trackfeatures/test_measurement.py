@@ -106,22 +106,6 @@ def test_mirroring_the_road_swaps_sides(lanes: int, width: float, to_middle: flo
             assert a == pytest.approx(-b, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("here", "ahead", "expected"),
-    [
-        (1 / 169, -1 / 50, tf.RoadClass.LEFT),
-        (-1 / 169, 1 / 50, tf.RoadClass.RIGHT),
-        (1 / 171, -1 / 50, tf.RoadClass.RIGHT),
-        (0.0, 1 / 100, tf.RoadClass.LEFT),
-        (1 / 171, -1 / 171, tf.RoadClass.STRAIGHT),
-    ],
-)
-def test_heading_class_looks_ahead_only_on_straights(
-    here: float, ahead: float, expected: tf.RoadClass
-) -> None:
-    assert tf.classify_heading(here, ahead) == expected
-
-
 @pytest.mark.parametrize(("lanes", "width"), [(0, 4.0), (4, 4.0), (2, 2.6), (2, 4.6)])
 def test_impossible_roads_are_refused(lanes: int, width: float) -> None:
     with pytest.raises(tf.UserError, match=r"lane"):

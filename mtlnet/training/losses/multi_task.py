@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy, smooth_l1_loss
 
 from mtlnet.training.recipes import HuberLoss
-from trackfeatures.definitions import UNKNOWN_HEADING
+from trackfeatures.road_class import UNKNOWN_HEADING
 
 Terms = Sequence[Tensor]
 """Loss terms () of the tasks, in the order of `TASKS`, before their weights."""

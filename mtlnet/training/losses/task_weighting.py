@@ -16,8 +16,8 @@ T = 2. A window has the steps of one epoch, but at most `WINDOW_STEPS`.
 import torch
 from torch import Tensor, nn
 
-from mtlnet.training.losses.alpha import TASKS, Alpha, require_method
 from mtlnet.training.losses.multi_task import Terms
+from mtlnet.training.losses.task_weights import TASKS, Alpha, require_method
 
 LIKELIHOOD_FACTORS = (0.5, 0.5, 1.0)
 """Factors of exp(-s) L for distance, angle and class. A normal distribution has half the squared

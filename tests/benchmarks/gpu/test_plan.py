@@ -15,7 +15,8 @@ from benchmarks.gpu.collecting import (
 )
 from benchmarks.gpu.plan import FULL, REHEARSAL, SECONDS, STAGES, Plan
 from benchmarks.gpu.process import Ended
-from mtlnet.inference.model_card import SHIPPED, read_card
+from mtlnet.inference.model_card import read_card
+from mtlnet.inference.shipped_models import SHIPPED
 from mtlnet.inference.trained_rounds import Seeds
 from trackfeatures.errors import UserError
 

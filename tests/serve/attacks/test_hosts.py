@@ -10,8 +10,8 @@ from serve.api.access import HostCheck
 from serve.cli import app
 from serve.config import Limits, ServiceConfig, check_proxies, network_of
 from serve.problems import Problem
-from serve.scheduling.admission import MAX_CLIENT_MS, Admission
 from serve.scheduling.fair_queue import FairQueue
+from serve.scheduling.overload import MAX_CLIENT_MS, Admission
 from serve.scheduling.rate_limit import RateLimiter, client_key
 from serve.scheduling.streams import stream_key
 from serve.shared_memory import create_shared_memory

@@ -33,9 +33,9 @@ from serve.api.features import SMALL_MS
 from serve.api.request_options import MAX_ACCEPT, negotiate
 from serve.config import MAX_BODY_BYTES, Limits
 from serve.problems import Problem
-from serve.scheduling.admission import MAX_CLIENT_MS, MAX_PENDING_MS, Admission
 from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.scheduling.fair_queue import PRESENT_NS, FairQueue
+from serve.scheduling.overload import MAX_CLIENT_MS, MAX_PENDING_MS, Admission
 from serve.shared_memory import create_shared_memory
 from tests.serve.attacks.conftest import Target
 from tests.serve.attacks.loop_time import LOOP_S, held_s

@@ -9,10 +9,10 @@ import torch
 
 from mtlnet.architecture import ANGLE_BINS, DISTANCE_BINS
 from mtlnet.model.bins import bin_targets, soft_cross_entropy, split_scores
-from mtlnet.training.losses.alpha import AlphaError, parse_alpha
 from mtlnet.training.losses.bins import bins_loss
 from mtlnet.training.losses.multi_task import Terms, multi_task_loss
 from mtlnet.training.losses.task_weighting import TaskWeighting
+from mtlnet.training.losses.task_weights import AlphaError, parse_alpha
 from mtlnet.training.recipes import RECIPES, HuberLoss
 
 OUTPUTS = torch.tensor(

@@ -1,13 +1,15 @@
-"""Limits the engine time that large images can use, by their estimated decoding time.
+"""Refuses frames under overload: a frame for which the queue has no room, and a large image that
+would use too much of the engine's time.
 
 The size of a request does not measure its work: a PNG of 65 KB can take 0.7 s. So large images are
-admitted by their decoding time, with limits for all clients and for each client. A client that is
-alone can use the whole engine. While other clients are present, its large images get a quarter of
-the engine's time, and an image is refused if the other clients' frames would overflow the queue
-while it is decoded. A client is an IPv4 address or an IPv6 /64 network.
+admitted by their estimated decoding time, with limits for all clients and for each client. A client
+that is alone can use the whole engine. While other clients are present, its large images get a
+quarter of the engine's time, and an image is refused if the other clients' frames would overflow
+the queue while it is decoded. A client is an IPv4 address or an IPv6 /64 network.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 
 from serve.config import network_of
 from serve.problems import OVERLOADED, Problem
@@ -21,6 +23,21 @@ MAX_BESIDE_MS = 200.0  # cost of one image if other clients are present: four fr
 MAX_CLIENTS = 1024  # number of clients whose credit is remembered
 
 Client = str
+
+
+def queue_full(waiting: int, wait_ms: int) -> Problem:
+    """Return the problem of a frame that is refused because `waiting` frames fill the queue.
+    `wait_ms`: expected time to process them, ms."""
+    return Problem(
+        OVERLOADED,
+        f"{waiting} frames are waiting; send this frame or a newer one later, or start the "
+        "service with more --workers",
+        wait_ms,
+    )
+
+
+shared_queue_full = lru_cache(64)(queue_full)
+"""`queue_full`, with one object for all frames that are refused under the same load."""
 
 
 class Admission:
