@@ -11,7 +11,7 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
+from mtlnet.inference.engine import Engine, load_engine, parse_kind, parse_precision
 from mtlnet.inference.image_decoding.decode import decode_file, read_whole_image
 from mtlnet.inference.model_card import ModelCard, resolve_run
 from mtlnet.inference.overlay import draw_markings
@@ -90,12 +90,22 @@ class Model:
     time."""
 
     def __init__(
-        self, run: Path, engine: str = "openvino", precision: str | None = None, threads: int = 1
+        self,
+        run: Path,
+        engine: str = "openvino",
+        precision: str | None = None,
+        threads: int = 1,
+        *,
+        views: int = 1,
     ) -> None:
         self.folder = run
         self._options = (parse_kind(engine), parse_precision(precision))
-        self._engine = load_engine(run, *self._options, threads=threads)
+        self._views = views
+        self._engine = self._load(threads)
         self._lock = Lock()
+
+    def _load(self, threads: int = 1) -> Engine:
+        return load_engine(self.folder, *self._options, threads=threads, views=self._views)
 
     @property
     def card(self) -> ModelCard:
@@ -210,7 +220,7 @@ class Model:
         """
         from mtlnet.evaluation.evaluate import evaluate
 
-        engines = [load_engine(self.folder, *self._options) for _ in range(os.cpu_count() or 1)]
+        engines = [self._load() for _ in range(os.cpu_count() or 1)]
         written = None if page is None else Path(page)
         return evaluate(engines, Path(data), split, page=written, every=every, copies=copies)
 
@@ -243,6 +253,7 @@ def load(
     engine: str = "openvino",
     precision: str | None = None,
     threads: int = 1,
+    views: int = 1,
 ) -> Model:
     """Load a model for prediction.
 
@@ -250,9 +261,12 @@ def load(
     name of a run in `runs/`, or the folder of a run. `engine`: "openvino" or "torch". `precision`:
     "int8", "bf16" or "f32"; None: int8 if the model has an int8 graph that passed its accuracy
     gate, else bf16 if the processor supports it, else f32. `threads`: number of CPU threads that
-    compute one image. Raises ModelError when the model is missing or damaged.
+    compute one image. `views`: 1, 2 (and the mirrored image) or 6 (and both turned left and right)
+    views of each image, whose answers are averaged; the time is proportional to it. Raises
+    ModelError when the model is missing or damaged.
     """
-    return Model(resolve_run(str(model)), engine, precision, threads)
+    run = resolve_run(str(model))
+    return Model(run, engine, precision, threads, views=views)
 
 
 def _pixels(image: OneImage) -> Image:

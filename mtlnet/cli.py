@@ -138,6 +138,7 @@ def evaluate_command(
     copies: options.Copies = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
+    views: options.Views = 1,
     as_json: command.AsJson = False,
 ) -> None:
     """Evaluate a model on a dataset: print its errors in m and rad, and the errors of a baseline
@@ -156,7 +157,9 @@ def evaluate_command(
 
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
-    engines = [_load(model, engine, precision, gpu=True) for _ in range(os.cpu_count() or 1)]
+    engines = [
+        _load(model, engine, precision, gpu=True, views=views) for _ in range(os.cpu_count() or 1)
+    ]
     with command.progress("evaluating") as report:
         if protocol:
             result = evaluate_protocol(engines, data, protocol, report, every)
@@ -182,6 +185,7 @@ def predict_command(
     topic: options.Topic = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
+    views: options.Views = 1,
     as_json: command.AsJson = False,
 ) -> None:
     """Predict track features of images, films, webcams, streams, rounds, Foxglove files or ROS 2
@@ -197,7 +201,7 @@ def predict_command(
     if camera is not None and fov_y_deg is not None and not own:
         raise UserError("--camera holds the field of view; leave --fov-y-deg out")
     _print_model(model)
-    loaded = _load(model, engine, precision)
+    loaded = _load(model, engine, precision, views=views)
     known = loaded.card.camera
     with command.progress_bar() as bar:
         task = bar.add_task("predicting", total=None)
@@ -290,13 +294,25 @@ def _print_model(name: str) -> None:
     typer.echo(f"model: {resolve_run(name)}", err=True)
 
 
-def _load(model: str, kind: str, precision: str | None, *, gpu: bool = False) -> "Engine":
+def _load(
+    model: str,
+    kind: str,
+    precision: str | None,
+    *,
+    gpu: bool = False,
+    views: int = 1,
+) -> "Engine":
     """Load a model's engine, with one thread. `gpu`: the torch engine can use a GPU."""
     from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
     from mtlnet.inference.model_card import resolve_run
 
     return load_engine(
-        resolve_run(model), parse_kind(kind), parse_precision(precision), threads=1, gpu=gpu
+        resolve_run(model),
+        parse_kind(kind),
+        parse_precision(precision),
+        threads=1,
+        gpu=gpu,
+        views=views,
     )
 
 

@@ -25,6 +25,13 @@ Precision = Annotated[
         show_default="int8 if it passed its accuracy gate, else bf16 if the CPU has it, else f32",
     ),
 ]
+Views = Annotated[
+    int,
+    typer.Option(
+        help="Number of views of each image whose answers are averaged: 1; 2 (and mirrored: errors "
+        "a tenth smaller); 6 (and turned left and right). The time is proportional to it."
+    ),
+]
 
 # Options of `train`, beside the fields of TrainConfig.
 Heads = Annotated[

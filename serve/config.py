@@ -56,6 +56,8 @@ class ServiceConfig:
     limits: Limits = field(default_factory=Limits)
     cameras: tuple[str, ...] = ()
     """NAME=FILE of each camera that requests can name."""
+    views: int = 1
+    """Number of views of each image whose answers are averaged: 1, 2 or 6."""
 
 
 def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:

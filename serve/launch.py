@@ -33,7 +33,9 @@ def run(config: ServiceConfig) -> None:
 async def _serve(
     config: ServiceConfig, listeners: list[socket.socket], cameras: dict[str, CameraParameters]
 ) -> None:
-    plan = ServicePlan(config.model, resolve_run, config.workers, config.limits, cameras)
+    plan = ServicePlan(
+        config.model, resolve_run, config.workers, config.limits, cameras, config.views
+    )
     supervisor = Supervisor(plan, listeners)
     port = listeners[0].getsockname()[1]
     first = await supervisor.start()
@@ -41,7 +43,9 @@ async def _serve(
         return
     sys.stderr.write(
         f"serving {_model_label(config.model, supervisor.folder)}, model {first['model'][:12]}, "
-        f"with {first['engine']} {first['precision']} at {address(listeners[0], config.host)}"
+        f"with {first['engine']} {first['precision']}"
+        f"{f' and --views {config.views}' if config.views > 1 else ''} "
+        f"at {address(listeners[0], config.host)}"
         f"{f' ({shown_addresses(listeners)})' if len(listeners) > 1 else ''}"
         f"{f', {config.workers} workers' if config.workers > 1 else ''}\n"
     )

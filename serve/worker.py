@@ -73,7 +73,7 @@ def main() -> None:
     shared = attach_shared_memory(task.memory, task.blocks)
     logs.set_up(shared.workers)
     try:
-        engine = load(Path(task.folder), task.expected)
+        engine = load(Path(task.folder), task.expected, views=task.views)
     except UserError as error:
         supervisor.send(failed=task.generation, why=str(error))
         return
@@ -84,16 +84,16 @@ def main() -> None:
     app.frame_queue.on_warm(lambda: send_ready(supervisor))
     peers = WorkerPeers(shared, task.block)
     server = WorkerServer(app, task.limits, peers)
-    arguments = (supervisor, lines, server, app)
+    arguments = (supervisor, lines, server, app, task.views)
     threading.Thread(target=handle_commands, args=arguments, daemon=True).start()
     server.run(sockets=[socket.socket(fileno=number) for number in task.listeners])
     peers.withdraw()
 
 
-def load(folder: Path, expected: str | None) -> Engine:
+def load(folder: Path, expected: str | None, *, views: int) -> Engine:
     """Load the engine of the run in `folder`. Raises UserError if that fails, or if its weights do
     not have the hash `expected`."""
-    engine = load_engine(folder)
+    engine = load_engine(folder, views=views)
     found = engine.card.model_hash
     if expected is not None and found != expected:
         raise UserError(
@@ -112,24 +112,36 @@ def send_ready(supervisor: SupervisorConnection) -> None:
 
 
 def handle_commands(
-    supervisor: SupervisorConnection, lines: Iterator[str], server: WorkerServer, app: Service
+    supervisor: SupervisorConnection,
+    lines: Iterator[str],
+    server: WorkerServer,
+    app: Service,
+    views: int,
 ) -> None:
     """Execute the supervisor's commands until it closes the socket, then stop the server."""
     for line in lines:
         message = json.loads(line)
         if "load" in message:
-            reload(supervisor, app, message["load"], message["generation"])
+            folder, generation = message["load"], message["generation"]
+            reload(supervisor, app, folder, generation, views=views)
         elif "drop" in message:
             app.frame_queue.drop_staged_model()
     server.should_exit = True
 
 
-def reload(supervisor: SupervisorConnection, app: Service, folder: str, generation: int) -> None:
+def reload(
+    supervisor: SupervisorConnection,
+    app: Service,
+    folder: str,
+    generation: int,
+    *,
+    views: int,
+) -> None:
     """Load and check new weights while the old weights are in use. The new weights replace the old
     ones once the supervisor commits `generation`."""
     head = app.shared.head()
     try:
-        engine = load(Path(folder), None)
+        engine = load(Path(folder), None, views=views)
         warm_up(engine)
     except UserError as error:
         supervisor.send(failed=generation, why=str(error))

@@ -7,8 +7,8 @@ from controllers.laws.actor import mirror_of
 from controllers.laws.actor_state import StateDefinition
 from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import Algorithm
+from controllers.rl.ddpg_td3_updates import Batch, Trained, actor_update, critic_update
 from controllers.rl.networks import Array, Shape, forward, layers
-from controllers.rl.updates import Batch, Trained, actor_update, critic_update
 
 TARGET_NOISE_CUT = 2.5  # standard deviations; TD3 clips noise of 0.2 at 0.5
 

@@ -21,7 +21,7 @@ from mtlnet.evaluation.html_report import page_file, write_page, write_worst_she
 from mtlnet.evaluation.metrics import evaluate_by_groups
 from mtlnet.evaluation.picture_page import write_picture_page
 from mtlnet.evaluation.pictures import judge, picture_report
-from mtlnet.inference.engine import Engine
+from mtlnet.inference.engine import Engine, ViewAverage
 from mtlnet.inference.model_card import ModelCard, ModelError
 from mtlnet.inference.trained_rounds import Seeds
 from runtime.files import check_folder
@@ -130,6 +130,7 @@ def about(engine: Engine) -> dict[str, Any]:
         "model_hash": engine.card.model_hash,
         "engine": engine.kind,
         "precision": engine.precision,
+        "views": engine.views.count if isinstance(engine, ViewAverage) else 1,
     }
 
 

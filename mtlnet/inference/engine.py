@@ -23,6 +23,7 @@ from mtlnet.inference.model_card import (
     check_files,
     read_card,
 )
+from mtlnet.inference.view_average import Views, mean_outputs
 from runtime.files import file_hash, utf8_path
 from runtime.processor import has_int8
 
@@ -62,6 +63,7 @@ def load_engine(
     threads: int = 1,
     *,
     gpu: bool = False,
+    views: int = 1,
 ) -> Engine:
     """Load the model in folder `run`, which `mtlnet.inference.model_card.resolve_run` finds by
     name.
@@ -69,10 +71,24 @@ def load_engine(
     `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate and
     is reliable on this processor (`uses_int8`), else bf16 if the processor supports it, else
     float32. The torch engine supports only float32; with `gpu` it computes on a GPU if there is
-    one. `threads`: number of CPU threads for one image. Raises ModelError when the model is
+    one. `threads`: number of CPU threads for one image. `views`: 1, 2 or 6 views of each image,
+    whose outputs are averaged; the time is proportional to it. Raises ModelError when the model is
     missing, unfinished or damaged.
     """
     card = read_card(run)
+    engine = _load_plain(run, card, kind, precision, threads, gpu=gpu)
+    return engine if views == 1 else ViewAverage(engine, views)
+
+
+def _load_plain(
+    run: Path,
+    card: ModelCard,
+    kind: EngineKind,
+    precision: Precision | None,
+    threads: int,
+    *,
+    gpu: bool,
+) -> Engine:
     if kind == "torch":
         if precision not in (None, "f32"):
             raise ModelError(
@@ -83,6 +99,29 @@ def load_engine(
 
         return TorchEngine(run, card, threads, gpu=gpu)
     return OpenVinoEngine(run, card, precision, threads)
+
+
+class ViewAverage:
+    """An engine that averages the outputs of `plain` for `count` views of each image
+    (`mtlnet.inference.view_average`)."""
+
+    def __init__(self, plain: Engine, count: int) -> None:
+        self.plain = plain
+        self.card, self.kind, self.precision = plain.card, plain.kind, plain.precision
+        self.on_gpu = bool(getattr(plain, "on_gpu", False))
+        self.views = Views(count, plain.card.camera)
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self.card.check_image(image)
+        outputs = np.stack([self.plain(view) for view in self.views.of(image)])
+        mean: NDArray[np.float32] = mean_outputs(outputs[:, None])[0]
+        return mean
+
+    def batch(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Compute the outputs (B, K) for uint8 images (B, H, W, 3) with the torch engine."""
+        views = zip(*map(self.views.of, images), strict=True)
+        found = [self.plain.batch(np.stack(view)) for view in views]  # type: ignore[attr-defined]
+        return mean_outputs(np.stack(found))
 
 
 class OpenVinoEngine:

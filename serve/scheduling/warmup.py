@@ -6,7 +6,7 @@ contains the outputs of torch in float32 for this image, computed when the model
 
 import numpy as np
 
-from mtlnet.inference.engine import Engine
+from mtlnet.inference.engine import Engine, ViewAverage
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import ModelError
 from mtlnet.inference.prediction import OUTPUTS
@@ -25,6 +25,8 @@ def warm_up(engine: Engine) -> None:
     the published one by more than the tolerance of the engine's precision (TOLERANCE)."""
     card = engine.card
     image = golden_image(card.camera.width, card.camera.height)
+    if isinstance(engine, ViewAverage):  # the published outputs are not averaged
+        engine = engine.plain
     for _ in range(WARM_UP_RUNS):
         outputs = engine(image)[:OUTPUTS]
     expected = np.asarray(card.golden, np.float32)

@@ -46,6 +46,7 @@ class ServicePlan:
     workers: int
     limits: Limits
     cameras: dict[str, CameraParameters] = field(default_factory=dict)
+    views: int = 1
 
 
 class Supervisor:
@@ -229,6 +230,7 @@ class Supervisor:
             block=block,
             limits=self._plan.limits,
             cameras=self._plan.cameras,
+            views=self._plan.views,
         )
         return await start_worker(task)
 

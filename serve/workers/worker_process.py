@@ -38,6 +38,7 @@ class WorkerTask:
     block: int
     limits: Limits
     cameras: dict[str, CameraParameters] = field(default_factory=dict)
+    views: int = 1
 
     def to_json_line(self) -> bytes:
         """Return the task as one line of JSON."""

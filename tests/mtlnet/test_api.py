@@ -174,6 +174,13 @@ def test_evaluation_and_export_are_those_of_the_commands(
     words = ["evaluate", "--model", str(published), "--data", str(dataset), "--precision", "f32"]
     told = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)
     assert model.evaluate(dataset)["errors"] == told["errors"]
+    averaged = json.loads(CliRunner().invoke(app, [*words, "--views", "2", "--json"]).stdout)
+    assert (told["views"], averaged["views"]) == (1, 2)
+    assert (
+        load(published, precision="f32", views=2).evaluate(dataset)["errors"]
+        == (averaged["errors"])
+    )
+    assert averaged["errors"] != told["errors"]
     result = model.export("onnx", data=dataset, out=tmp_path / "onnx", frames=4)
     assert (tmp_path / "onnx" / "model.onnx").is_file()
     assert result["check"]["frames"] == 4

@@ -142,6 +142,26 @@ def test_both_workers_behind_one_port_answer_alike_and_log_every_request(publish
     assert len(pids) == len({pid for _, pid in pids}) == 2
 
 
+def test_views_are_averaged_also_after_a_reload(published: Path) -> None:
+    arguments = ("--model", str(published), "--port", "0", "--views", "2")
+    image = golden_image(280, 210)
+    image[:, :100] //= 2  # not symmetric
+    expected, single = (
+        decode_outputs(load_engine(published, views=views)(image)).as_json() for views in (2, 1)
+    )
+    assert expected != single
+    with started(*arguments) as (_process, line):
+        assert "and --views 2 at http" in line
+        client = Client(address(line))
+        client.wait_until_ready(PATIENCE_S)
+        for _ in range(2):
+            answer = client.features(png(image[:, :, ::-1]))
+            assert {key: answer[key] for key in expected} == expected
+            port = address(line).rpartition(":")[2]
+            done = typed("serve", "reload", "--port", port, folder=ROOT)
+            assert done.returncode == 0, done.stderr
+
+
 def test_an_unusable_model_is_an_error_of_one_line(published: Path, tmp_path: Path) -> None:
     assert "no run" in refused("--model", str(tmp_path / "none"))
     assert "train" in refused("--model", "latest", folder=tmp_path)
@@ -155,6 +175,9 @@ def test_an_unusable_model_is_an_error_of_one_line(published: Path, tmp_path: Pa
         file.seek(1000)
         file.write(b"x" * 100)
     assert "damaged" in refused("--model", str(other), "--port", "0")
+    assert "--views 3: give 1, 2 or 6" in refused(
+        "--model", str(published), "--port", "0", "--views", "3"
+    )
 
 
 def test_a_taken_port_and_an_unknown_host_are_errors_of_one_line(published: Path) -> None:

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from controllers.rl.ddpg_td3_updates import Batch, Trained, actor_update, critic_update
 from controllers.rl.networks import Array, Shape, backward, forward, initial, layers
-from controllers.rl.updates import Batch, Trained, actor_update, critic_update
 
 torch = pytest.importorskip("torch")
 RNG = np.random.default_rng(5)
