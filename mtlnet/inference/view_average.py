@@ -2,7 +2,7 @@
 
 The views are the image, the mirrored image, and both turned by `TURN_RAD` to the left and to the
 right. The errors of the answers for different views are only partly correlated, so their mean has
-smaller errors (docs/experiments/network.md). The model runs once for each view.
+smaller errors (docs/experiments/views.md). The model runs once for each view.
 """
 
 from functools import cached_property
@@ -24,6 +24,10 @@ COUNTS = (1, 2, 6)
 TURN_RAD = 0.04
 """Angle by which the camera is turned, rad. A turned view adds this angle to the answered angle,
 and moves the distances. The two directions cancel each other in the mean."""
+STD_FACTORS = {1: 1.0, 2: 0.84, 6: 0.74}
+"""Ratio of the standard deviation of the mean's error to the mean of the views' standard
+deviations, by the number of views. With it the shares of errors within one standard deviation are
+those of a single view; measured for the shipped models (docs/experiments/views.md)."""
 
 _SWAP = {"ml": "mr", "mr": "ml", "l": "r", "r": "l"}
 _FROM = [FEATURES.index(_SWAP.get(name, name)) for name in FEATURES]
@@ -89,7 +93,8 @@ def mean_outputs(outputs: Outputs) -> Outputs:
     """Return the mean (N, K) of the outputs (V, N, K) for V views of N images, in the order of
     `Views.of`; `split_outputs` explains the K columns.
 
-    All columns are averaged, but for two cases. The mean of a distance does not include views in
+    All columns are averaged, but for three cases. The mean of the standard deviations is multiplied
+    by the factor in `STD_FACTORS`. The mean of a distance does not include views in
     which the marking is absent. A marking is absent if the mean of its probabilities of absence
     exceeds its limit (`ABSENT_ABOVE`); for a model without these probabilities, if it is absent in
     the first view.
@@ -100,6 +105,8 @@ def mean_outputs(outputs: Outputs) -> Outputs:
     back = [mirror_outputs(each) if i % 2 else each for i, each in enumerate(outputs)]
     mean: Outputs = np.mean(back, axis=0, dtype=np.float32)
     parts = split_outputs(mean)
+    if parts.std is not None:
+        parts.std[:] *= STD_FACTORS[len(outputs)]
     found = np.stack([tf.decode(split_outputs(each).coded)[0] for each in back])
     present = np.isfinite(found)
     total = np.where(present, found, 0.0).sum(0)

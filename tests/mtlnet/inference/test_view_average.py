@@ -55,6 +55,9 @@ def test_values_are_averaged_over_the_views_that_contain_the_marking() -> None:
     assert found.distances_m["mr"] == pytest.approx(2.9, abs=1e-5)
     assert found.angle_rad == pytest.approx(0.03, abs=1e-6)
     assert found.absent == pytest.approx(dict.fromkeys(tf.MARKINGS, 0.2))
+    assert found.std is not None
+    assert found.std["ml"] == pytest.approx(0.84 * 0.1)
+    assert found.std["angle"] == pytest.approx(0.84 * 0.7)
     without = outputs_of({}, absent=0.3)
     found = decode_outputs(mean_outputs(np.stack([first, mirror_outputs(without)]))[0])
     assert found.distances_m["ml"] == pytest.approx(-1.0, abs=1e-5)
