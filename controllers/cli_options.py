@@ -38,6 +38,11 @@ Steps = Annotated[
 ]
 MODELS = 'a run folder, its name in runs/, "latest", or a shipped model: "default" or "varied".'
 Model = Annotated[str, f"Model to use with --perception model: {MODELS}"]
+Views = Annotated[
+    int,
+    "Number of views of each image whose answers are averaged, with --perception model: 1; 2 (and "
+    "mirrored); 6 (and turned left and right).",
+]
 Latency = Annotated[float, "Latency of the perception's answers, ms, 0 to 1000."]
 Drop = Annotated[float, "Share of the perception's answers that are lost, 0 to below 1."]
 Light = Annotated[

@@ -41,6 +41,7 @@ class CompareConfig:
     latency_ms: options.Latency = 0.0
     drop: options.Drop = 0.0
     model: options.Model = "default"
+    views: options.Views = 1
     light: options.Light = "clear"
     parameters: options.Parameters = None
     tracks_dir: options.TracksDir = None

@@ -34,7 +34,7 @@ from trackfeatures.errors import UserError
 VERSION = 3
 """Version of `results.json`."""
 RESULTS, REPORT = "results.json", "report.html"
-SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "light")
+SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "views", "light")
 """Settings that are equal for all drives of a file."""
 
 Progress = Callable[[float, int, str], None]
@@ -186,6 +186,7 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
                 latency_ms=config.latency_ms,
                 drop=config.drop,
                 model=config.model,
+                views=config.views,
                 light=config.light,
                 seed=cell.seed,
                 parameters=tuned[cell.controller],
@@ -309,7 +310,7 @@ def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:
         return {"version": VERSION, "settings": settings, "drives": []}
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-        found, version = content["settings"], content["version"]
+        found, version = {"views": 1, **content["settings"]}, content["version"]
         _ = [(_key(entry), entry["code"]) for entry in content["drives"]]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} holds no results ({error!r}); give another --out") from error

@@ -48,6 +48,7 @@ class DriveConfig:
     ] = False
     parameters: options.Parameters = None
     model: options.Model = "default"
+    views: options.Views = 1
     start_d: Annotated[
         float | None,
         "Start, m left of the track's centre. Default: the centre of --target-lane, or 0.",

@@ -109,7 +109,7 @@ def drive(
         )
         world.reset(seed=config.seed, to_middle=lane.start_d)
         scene: dict[str, Any] = {"light": config.light, "seed": config.seed}
-        scene |= {"model": config.model, "lane_centre": lane.centre}
+        scene |= {"model": config.model, "views": config.views, "lane_centre": lane.centre}
         source = stack.enter_context(open_perception(config.perception, world, **scene))
         watching = [*observers, *_observers(config, stack, world, source, lane)]
         live = _real_time(config, source, disturbance) if config.realtime else None

@@ -58,14 +58,15 @@ def truth(lane_centre: float) -> Perceive:
 
 
 class LocalModel:
-    """The model of the run `run` (a folder or a name), computed in this process."""
+    """The model of the run `run` (a folder or a name), computed in this process. Its answers are
+    averaged over `views` views of each image (`mtlnet.inference.view_average`)."""
 
-    def __init__(self, run: str) -> None:
+    def __init__(self, run: str, views: int = 1) -> None:
         from mtlnet.inference.engine import load_engine
         from mtlnet.inference.model_card import resolve_run
         from mtlnet.inference.prediction import decode_outputs
 
-        self._engine = load_engine(resolve_run(run))
+        self._engine = load_engine(resolve_run(run), views=views)
         self._decode = decode_outputs
         self.camera: CameraParameters = self._engine.card.camera
 
@@ -202,9 +203,17 @@ def check_perception(name: str, model: str) -> None:
 
 @contextmanager
 def open_perception(
-    name: str, world: "World", *, model: str, lane_centre: float, light: str, seed: int
+    name: str,
+    world: "World",
+    *,
+    model: str,
+    lane_centre: float,
+    light: str,
+    seed: int,
+    views: int = 1,
 ) -> Iterator[Perceive]:
-    """Open the perception `name`: "truth", "model" (the run `model`), or a service's address.
+    """Open the perception `name`: "truth", "model" (the run `model`, whose answers are averaged
+    over `views` views of each image), or a service's address.
 
     `lane_centre` (m, left positive) is the centre of the lane to follow. The images have the light
     `light` (e.g. "clear") and random scenery by `seed`. Raises UserError for another name, a
@@ -216,7 +225,7 @@ def open_perception(
         return
     from simulator.camera import open_camera
 
-    network: FeatureModel = LocalModel(model) if name == "model" else ServiceModel(name)
+    network: FeatureModel = LocalModel(model, views) if name == "model" else ServiceModel(name)
     with (
         closing(network),
         closing(open_camera(world.road, network.camera, light=light, seed=seed)) as camera,

@@ -234,6 +234,18 @@ def test_other_settings_and_unknown_names_are_refused(
     assert (config.out / "results.json").read_bytes() == before
 
 
+def test_results_from_before_the_option_views_are_continued(tmp_path: Path) -> None:
+    config = short(tmp_path, tracks="oval", controllers="torcs")
+    compare(config)
+    path = config.out / "results.json"
+    content = json.loads(path.read_text())
+    assert content["settings"].pop("views") == 1
+    path.write_text(json.dumps(content))
+    compare(config)
+    with pytest.raises(UserError, match="views"):
+        compare(replace(config, views=2))
+
+
 @pytest.mark.parametrize("drives", [None, {"drives": [{"track": "oval"}]}, {}])
 def test_a_damaged_file_is_refused(tmp_path: Path, drives: dict[str, Any] | None) -> None:
     config = short(tmp_path)

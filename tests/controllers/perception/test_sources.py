@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 from controllers.perception.perceived import Perceive, Perceived
 from controllers.perception.sources import (
     CameraPerception,
+    LocalModel,
     ServiceModel,
     open_perception,
     parse_camera,
     parse_prediction,
 )
+from mtlnet.inference.engine import load_engine
+from mtlnet.inference.golden_image import golden_image
+from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.prediction import decode_outputs
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
@@ -30,6 +35,23 @@ ANSWER: dict[str, Any] = {
 CAMERA = {
     "width": 84, "height": 63, "x": 0.75, "y": 0.0, "z": 0.95, "pitch_deg": 0.0, "fov_y_deg": 67.5,
 }  # fmt: skip
+
+
+def test_the_model_averages_the_views_that_are_asked_for() -> None:
+    image = golden_image(280, 210)
+    image[:, :100] //= 2  # not symmetric
+    for views in (1, 2):
+        expected = decode_outputs(load_engine(resolve_run("default"), views=views)(image))
+        assert LocalModel("default", views).predict(image) == expected.as_json()
+    with World(Road(find_track("oval"))) as world:
+        world.reset(seed=0)
+        scene: dict[str, Any] = {"lane_centre": 0.0, "light": "clear", "seed": 0}
+        answers = []
+        for views in (1, 2):
+            with open_perception("model", world, model="default", views=views, **scene) as source:
+                answers.append(source(world))
+    assert answers[0].angle != answers[1].angle
+    assert answers[1].angle == pytest.approx(answers[0].angle, abs=0.02)
 
 
 class FakeClient:
