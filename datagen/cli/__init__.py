@@ -12,7 +12,8 @@ from datagen.cli.protocol import protocol
 from runtime import cli as command
 
 app = typer.Typer(
-    help="Record driver-view images with their track features, and check what was recorded.",
+    help="Record images of the driver's view with their track features, and check and export "
+    "the recorded datasets.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -30,43 +30,66 @@ PIPE_WIDTH = 120  # characters: width of tables if stdout is no terminal
 Out = Annotated[
     Path | None,
     typer.Option(
-        help="Dataset folder; an unfinished dataset is continued. "
-        f"Default: {DATASET_FOLDER}, or {UNSEEN_FOLDER} with --split unseen."
+        help="Dataset folder to write; an unfinished dataset in it is continued. Default: "
+        f"{DATASET_FOLDER}, or {UNSEEN_FOLDER} with --split unseen."
     ),
 ]
-Workers = Annotated[int, typer.Option(help="Recording processes; 0: one per core.")]
+Workers = Annotated[int, typer.Option(help="Number of processes that record; 0: one per CPU core.")]
 Tracks = Annotated[
     str,
     typer.Option(
-        help="Names or files of tracks, separated by commas; empty: all but the held-out tracks."
+        help="Names or files of the tracks to record, separated by commas; random: a random "
+        "road in each round. Default: all tracks of the project and of TORCS except the "
+        "four unseen tracks (coast, countryside, dirt-3, e-track-4); with --split "
+        "unseen, the unseen tracks."
     ),
 ]
-Lanes = Annotated[str, typer.Option(help="Numbers of lanes, separated by commas.")]
+Lanes = Annotated[
+    str,
+    typer.Option(
+        help="Numbers of lanes of the roads, 1 to 3, separated by commas; each round has one of "
+        "these numbers."
+    ),
+]
 Lights = Annotated[
     str,
     typer.Option(
-        help="Lights, separated by commas, from: clear, overcast, dusk, fog, heavy-shadow, rain, "
-        "snow; empty: all."
+        help="Kinds of light and weather, separated by commas, from: clear, overcast, dusk, "
+        "fog, heavy-shadow, rain, snow; empty (the default): all."
     ),
 ]
-TracksDir = Annotated[Path | None, typer.Option(help="A further folder to search for tracks.")]
+TracksDir = Annotated[
+    Path | None, typer.Option(help="Further folder in which tracks are looked up. Default: none.")
+]
 CameraFile = Annotated[
     Path | None,
     typer.Option(
         "--camera",
-        help="Camera file of driverview, OpenCV, ROS or Kalibr: record with its lens and mount.",
+        help="Camera file of driverview, OpenCV, ROS or Kalibr; the images are recorded with "
+        "the lens of this file, and with its position and angles on the car if it "
+        "contains them. Default: the camera of the shipped models.",
     ),
 ]
 ShardOf = Annotated[
-    str, typer.Option(help="Part of the plan, for batch systems: 2/4 is the second of four.")
+    str,
+    typer.Option(
+        help="Part of the plan to record, as NUMBER/COUNT, for example 2/4 for the second of four "
+        "parts. Each part is recorded into its own folder, and `datagen merge` joins the "
+        "folders. Default: the whole plan."
+    ),
 ]
 ExecutorName = Annotated[
     str,
     typer.Option(
-        help="local: processes of this machine. ray: the Ray cluster at $RAY_ADDRESS, or a new one."
+        help="Where the rounds are recorded: local (processes on this machine) or ray (the "
+        "Ray cluster at $RAY_ADDRESS; if the variable is not set, a new one on this "
+        "machine)."
     ),
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; record nothing.")]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Print the plan (the list of all rounds) and record nothing."),
+]
 
 
 @options_of(CollectConfig, make=dict)
@@ -84,7 +107,11 @@ def collect(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Record rounds with the scripted driver; the same command continues an interrupted dataset."""
+    """Record a dataset: a program, the scripted driver, drives the simulated car.
+
+    A dataset consists of rounds. A round is one recorded drive, with its images and labels in one
+    file. To continue an interrupted dataset, run the same command again.
+    """
     from datagen.planning.class_balance import TrackForecast
     from datagen.planning.plan import Shard
     from datagen.planning.planner import make_plan
@@ -176,12 +203,17 @@ def record_plan(
 
 def merge(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Dataset folders to merge.")
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Dataset folders to merge."),
     ],
-    out: Annotated[Path, typer.Option(help="Dataset folder to create or to add to.")],
+    out: Annotated[Path, typer.Option(help="Dataset folder to create, or to add the rounds to.")],
     as_json: AsJson = False,
 ) -> None:
-    """Merge datasets, such as the shards of one plan, into one dataset."""
+    """Copy the rounds of several datasets into one dataset.
+
+    The datasets are parts of one plan (`datagen collect --shard`), or datasets in which no two
+    rounds have the same name or seed.
+    """
     from datagen.execution.merge import merge as run
 
     merged = run(folders, out)

@@ -17,11 +17,12 @@ from datagen.planning.config import DATASET_FOLDER
 from datagen.recording.names import SIDES, UNSEEN
 from runtime.cli import AsJson, counted, print_result
 
-DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="A dataset folder.")]
+DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the dataset.")]
 
 
 def info(folder: DatasetFolder = DATASET_FOLDER, as_json: AsJson = False) -> None:
-    """Print the contents of a dataset, and the errors of always predicting the mean label."""
+    """Print the contents of a dataset, and the errors of a baseline that always answers the mean
+    label."""
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
 
@@ -33,11 +34,15 @@ def stats(
     folder: DatasetFolder = DATASET_FOLDER,
     out: Annotated[
         Path | None,
-        typer.Option(help="The page to write. Default: DIR/stats.html."),
+        typer.Option(help="HTML page to write. Default: DIR/stats.html."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write an HTML page: distributions, class balance, concerns (data faults), sample frames."""
+    """Write an HTML page about a dataset.
+
+    It shows the distributions of the labels, the shares of the classes of the road, possible faults
+    of the data, and sample frames.
+    """
     from datagen.recording.dataset import Dataset
     from datagen.recording.statistics import describe
     from datagen.stats.page import concerns, page
@@ -66,20 +71,26 @@ def export(
     ] = "webdataset",
     out: Annotated[
         Path | None,
-        typer.Option(help="The folder to write. Default: DIR-FORMAT."),
+        typer.Option(
+            help="Folder to write. Default: DIR-FORMAT, for example datasets/default-webdataset."
+        ),
     ] = None,
     split: Annotated[
         str,
         typer.Option(
-            help="Side of the split to export: train, test, unseen, or all, which writes separate "
-            "files for each side."
+            help="Rounds to export, by the side of the split `default`: train, test, unseen, "
+            "or all, which writes separate files for each side."
         ),
     ] = "all",
-    shard_size: Annotated[int, typer.Option(help="webdataset: frames per shard.")] = 1000,
+    shard_size: Annotated[
+        int, typer.Option(help="With --format webdataset: number of frames in each tar file.")
+    ] = 1000,
     shuffle: Annotated[
         bool,
         typer.Option(
-            "--shuffle", help="webdataset: frames in a fixed random order instead of by time."
+            "--shuffle",
+            help="With --format webdataset: write the frames in a random order, which is the "
+            "same in every export, instead of in the order of time.",
         ),
     ] = False,
     as_json: AsJson = False,
@@ -104,26 +115,46 @@ def export(
 
 def view(
     recorded: Annotated[
-        Path, typer.Argument(metavar="ROUND", help="A recorded round, such as rounds/ID.mcap.")
+        Path,
+        typer.Argument(metavar="ROUND", help="File of a recorded round, such as rounds/ID.mcap."),
     ],
     html: Annotated[
         Path | None,
-        typer.Option(help="Write an HTML page with images, map and plots."),
+        typer.Option(
+            help="HTML page to write, with images, map and plots, instead of opening a window."
+        ),
     ] = None,
     save: Annotated[
-        Path | None, typer.Option(help="Write a Rerun file (.rrd) instead of opening a window.")
+        Path | None, typer.Option(help="Rerun file (.rrd) to write instead of opening a window.")
     ] = None,
     web: Annotated[
-        bool, typer.Option("--web", help="Serve Rerun's viewer to browsers until interrupted.")
+        bool,
+        typer.Option(
+            "--web",
+            help="Show the round in the browser instead of in a window: serve Rerun's viewer "
+            "until Ctrl-C.",
+        ),
     ] = False,
     port: Annotated[
-        int, typer.Option(help="With --web: port of the viewer; the data use the next port.")
+        int,
+        typer.Option(
+            help="With --web: port of the viewer. The data are served on the port with the next "
+            "number."
+        ),
     ] = 9090,
-    as_json: AsJson = False,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print the round's name, its number of frames and the place where it is shown as "
+            "JSON on stdout.",
+        ),
+    ] = False,
 ) -> None:
-    """Show a round: images with the true markings, the road in 3D, plots of labels and driving.
+    """Show a round: images with the true lane markings, the road in 3D, plots of labels and
+    driving.
 
-    Without an option, a window of Rerun opens.
+    Without --html, --save or --web, a window of the program Rerun opens.
     """
     from datagen.view.contents import Contents
     from datagen.view.show import ShowConfig, show

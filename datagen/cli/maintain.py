@@ -21,17 +21,32 @@ if TYPE_CHECKING:
 Level = Annotated[
     str,
     typer.Option(
-        help="quick checks the end of each file and its message counts; full checks every byte; "
-        "deep also decodes every image and label."
+        help="What is checked. quick: the end of each file and the number of its messages; "
+        "full: every byte; deep: every byte, and every image and label is decoded."
     ),
 ]
 Replay = Annotated[
-    int, typer.Option(help="Number of rounds to simulate again; their labels must be bit-equal.")
+    int,
+    typer.Option(
+        help="Number of rounds to simulate again. The check fails if a simulated label or state "
+        "of the car differs in any byte from the recorded one. Only for datasets of `datagen "
+        "collect` and `datagen protocol`."
+    ),
 ]
 Pixels = Annotated[
-    bool, typer.Option("--pixels", help="With --replay: compare images too, on the same renderer.")
+    bool,
+    typer.Option(
+        "--pixels",
+        help="With --replay: the images must be equal, too. They are equal only if this machine "
+        "has the renderer (graphics driver and device) with which the dataset was recorded.",
+    ),
 ]
-TracksDir = Annotated[Path | None, typer.Option(help="With --replay: a further folder of tracks.")]
+TracksDir = Annotated[
+    Path | None,
+    typer.Option(
+        help="With --replay: further folder in which tracks are looked up. Default: none."
+    ),
+]
 
 
 def verify(
@@ -42,7 +57,7 @@ def verify(
     tracks_dir: TracksDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check that a dataset is unchanged since it was recorded; exit 1 if it is not."""
+    """Check that a dataset is unchanged since it was recorded; if it is not, the exit code is 1."""
     from rich.console import Console
     from rich.markup import escape
 
@@ -80,12 +95,14 @@ def _print_report(
 
 
 def recover(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A damaged round.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File of the damaged round (.mcap).")
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
-            help="File to write. Default: a new file beside FILE, or in DIR/recovered if FILE is "
-            "in DIR/rounds."
+            help="File to write. Default: a new file in the folder of FILE, or in "
+            "DIR/recovered if FILE is in DIR/rounds."
         ),
     ] = None,
     as_json: AsJson = False,
@@ -101,32 +118,47 @@ def recover(
 
 def split(
     folder: DatasetFolder,
-    name: Annotated[str, typer.Option(help="Name of the split: splits/NAME.json.")] = "default",
+    name: Annotated[
+        str, typer.Option(help="Name of the split, which is the file DIR/splits/NAME.json.")
+    ] = "default",
     by: Annotated[
         str,
-        typer.Option(help="Create the split: by round, or by track (no track is on two sides)."),
+        typer.Option(
+            help="Create the split. round: rounds are assigned at random; track: tracks are "
+            "assigned at random, and all rounds of a track are on the same side. Default: "
+            "check the existing split."
+        ),
     ] = "",
     test_share: Annotated[
-        float, typer.Option(help="With --by: share of rounds for testing.")
+        float,
+        typer.Option(help="With --by: share of the rounds that are kept for testing, 0 to 1."),
     ] = CollectConfig.test_share,
-    seed: Annotated[int, typer.Option(help="With --by: seed of the random choice.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="With --by: seed of the random assignment, 0 or more.")
+    ] = 0,
     with_recovered: Annotated[
-        bool, typer.Option("--with-recovered", help="With --by: include recovered rounds.")
+        bool,
+        typer.Option(
+            "--with-recovered",
+            help="With --by: also assign the rounds that `datagen recover` wrote.",
+        ),
     ] = False,
     near: Annotated[
         str,
         typer.Option(
-            help="Two frames are near-duplicates if they differ by at most these values: m along "
-            "the road, m across it, deg of yaw."
+            help="Largest differences between near-duplicates, as three numbers separated by "
+            "commas: m along the road, m across the road, degrees of the angle to the "
+            "road."
         ),
     ] = "0.5,0.1,0.5",
     as_json: AsJson = False,
 ) -> None:
-    """Check a split, or create one with --by. No round, seed or content may be on two sides.
+    """Check a split of a dataset into rounds for training and for testing, or create one with --by.
 
-    The command counts test and unseen frames with a near-duplicate in train: a frame of the same
-    road and light with a similar position, offset and yaw. A split that leaks is refused; an
-    existing split is not overwritten.
+    The sides of a split are train, test and unseen (rounds on tracks that are kept for tests). A
+    split in which the same round, seed or content is on two sides is refused. The command counts
+    the frames of test and unseen that have a near-duplicate in train: a frame of the same track
+    and light at a similar position and angle to the road. An existing split is not overwritten.
     """
     from datagen.recording.split_report import SplitConfig, check_split, format_report, make_split
 

@@ -15,7 +15,9 @@ from runtime.options import options_of
 
 FOLDER = Path("datasets/protocol")
 
-Out = Annotated[Path, typer.Option(help="Dataset folder; an unfinished one is continued.")]
+Out = Annotated[
+    Path, typer.Option(help="Dataset folder to write; an unfinished dataset in it is continued.")
+]
 
 
 @options_of(ProtocolConfig)
@@ -26,11 +28,14 @@ def protocol(
     tracks_dir: TracksDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Record the test data of the paper's protocol, for `mtlnet evaluate --protocol paper`.
+    """Record the drives on which `mtlnet evaluate --protocol paper` evaluates a model.
 
-    The data are laps near the middle of g-track-3 and of dirt-3, each in clear light and in heavy
-    shadow, and rounds on the paper's nine tracks. The tracks of TORCS are needed. The same command
-    continues an interrupted recording.
+    They are similar to the test drives of the paper (Li et al., "Reinforcement Learning and Deep
+    Learning based Lateral Control for Autonomous Driving"). There are four drives near the middle
+    of a one-lane road: on the tracks g-track-3 and dirt-3, each in clear light and in heavy shadow.
+    There are also rounds on nine tracks: the six that the paper names, and three others. All these
+    tracks belong to TORCS, so TORCS must be installed, or --tracks-dir must contain its tracks. To
+    continue an interrupted recording, run the same command again.
     """
     from datagen.planning.class_balance import TrackForecast
     from datagen.planning.protocol import protocol_plan

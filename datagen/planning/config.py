@@ -42,29 +42,38 @@ class TrackChoice:
     content_hash: str
 
 
-Rounds = Annotated[int, Option(help="Number of rounds.")]
-Frames = Annotated[int, Option(help="Frames per round.")]
-Seed = Annotated[int, Option(help="Seed of all random choices.")]
+Rounds = Annotated[int, Option(help="Number of rounds (recorded drives).")]
+Frames = Annotated[int, Option(help="Number of frames in each round.")]
+Seed = Annotated[int, Option(help="Seed of all random choices, 0 or more.")]
 TestShare = Annotated[
     float,
-    Option("--split-test-share", help="Share of the rounds held out for testing, 0 to below 1."),
+    Option(
+        "--split-test-share", help="Share of the rounds that are kept for testing, 0 to below 1."
+    ),
 ]
 Stretch = Annotated[
     int,
     Option(
-        help="Frames after which scenery, light and weather change; 0: they never change. "
-        "Use 1 for training sets."
+        help="Number of frames after which scenery, light and weather change; 0: they never "
+        "change during a round. Use 1 for training sets."
     ),
 ]
 Scenes = Annotated[
     int,
     Option(
-        help="Number of different sceneries in a round, shown in turn; --stretch sets the frames "
-        f"between two changes. 0: one scenery per {FRAMES_PER_SCENE} frames."
+        help="Number of different scenes (scenery with light and weather) in a round, which "
+        "are shown in turn. Only with --stretch, which sets the number of frames between "
+        f"two changes. 0: one scene per {FRAMES_PER_SCENE} frames of the round, at least "
+        "one."
     ),
 ]
 SplitName = Annotated[
-    str, Option(help="unseen: record only the tracks that training plans leave out.")
+    str,
+    Option(
+        help="unseen: record only rounds for tests on tracks that are not used for training, by "
+        "default on the four unseen tracks. Default: record rounds for training and for "
+        "testing."
+    ),
 ]
 
 
@@ -79,30 +88,44 @@ class CollectConfig:
     lanes: tuple[int, ...] = (1, 2, 3)
     lights: tuple[str, ...] = field(default_factory=all_lights)
     test_share: TestShare = 0.25
-    codec: Annotated[str, Option(help="Image codec: jpeg (quality 95) or png (lossless).")] = "jpeg"
+    codec: Annotated[
+        str, Option(help="Format of the images: jpeg (quality 95 of 100) or png (lossless).")
+    ] = "jpeg"
     frequency_hz: Annotated[
         int,
-        Option("--frequency", help="Frames per second. The car is controlled at 20 Hz or faster."),
+        Option(
+            "--frequency",
+            help="Number of recorded frames per second of the drive, a divisor of 200. The car is "
+            "controlled at 20 Hz or faster even if this number is smaller.",
+        ),
     ] = 20
     camera: CameraParameters = field(default_factory=CameraParameters)
     stretch: Stretch = 0
     scenes: Scenes = 0
     jitter_camera: Annotated[
         bool,
-        Option("--jitter-camera", help="Vary height, pitch and field of view from round to round."),
+        Option(
+            "--jitter-camera",
+            help="Give the camera of each round a random height (up to 0.08 m higher or lower), "
+            "pitch (up to 1.5 degrees more or less) and vertical field of view (up to 3 "
+            "degrees more or less).",
+        ),
     ] = False
     roads: Annotated[
         str,
         Option(
-            help="paper: lanes of 4.0 m and the tracks' own paint; varied: lanes, shoulders, "
-            "paint, surface, light and camera height are random for each round or scene."
+            help="Kind of the roads. paper: lanes of 4.0 m, as in the paper by Li et al. on "
+            "lateral control, and the tracks' own lane markings. varied: width of the "
+            "lanes, shoulders, style of the lane markings and camera height are random "
+            "for each round, and road surface, wear of the markings and light for each "
+            "scene."
         ),
     ] = "paper"
     prefix: Annotated[
         str,
         Option(
-            help="First part of the rounds' names. Collections can be merged if each has its own "
-            "prefix and seed."
+            help="First part of the rounds' names. `datagen merge` merges datasets that have "
+            "been recorded with different --prefix and --seed."
         ),
     ] = "round"
     split: SplitName = ""
@@ -179,9 +202,11 @@ class ProtocolConfig:
     """Options of `datagen protocol`. By default 15 rounds of 2,000 images are recorded, as many
     images as the paper has. The constructor raises UserError unless `laps` is positive."""
 
-    rounds: Annotated[int, Option(help="Rounds on the nine tracks.")] = 15
-    frames: Annotated[int, Option(help="Frames per round on the nine tracks.")] = 2000
-    laps: Annotated[float, Option(help="Laps of each of the four drives.")] = 1.0
+    rounds: Annotated[int, Option(help="Number of rounds on the nine tracks.")] = 15
+    frames: Annotated[int, Option(help="Number of frames in each round on the nine tracks.")] = 2000
+    laps: Annotated[
+        float, Option(help="Number of laps of each of the four drives on g-track-3 and dirt-3.")
+    ] = 1.0
     seed: Seed = 1810
 
     def __post_init__(self) -> None:
