@@ -24,25 +24,54 @@ class AblationConfig:
     """Settings of an ablation. When an interrupted ablation is continued, only `seeds`, `device`
     and `threads` can differ."""
 
-    out: Annotated[Path, Option(help="Folder of the ablation; an existing one is continued.")]
-    iterations: Annotated[int, Option(help="Number of training steps of every run.")]
-    data: Annotated[Path, Option(help="Dataset folder.")] = Path("datasets/default")
+    out: Annotated[
+        Path,
+        Option(
+            help="Folder to write the trainings and the table to; an interrupted ablation in it is "
+            "continued."
+        ),
+    ]
+    iterations: Annotated[int, Option(help="Number of steps of each training.")]
+    data: Annotated[Path, Option(help="Folder of the dataset.")] = Path("datasets/default")
     seeds: Annotated[
         tuple[int, ...],
         Option(
             parser=parse_seeds,
             metavar="TEXT",
-            help="Seeds, separated by commas; every row is trained once with each.",
+            help="Seeds of the trainings, separated by commas; each row of the table is "
+            "trained once with each seed.",
         ),
     ] = (1, 2, 3)
-    recipe: Annotated[str, Option(help="Training recipe: fast or paper.")] = "fast"
-    batch: Annotated[int, Option(help="Images per step.")] = 32
-    split: Annotated[str, Option(help="Rounds to evaluate on: test or unseen.")] = "test"
-    every: Annotated[int, Option(help="Evaluate only every n-th frame.", min=1)] = 5
+    recipe: Annotated[
+        str,
+        Option(
+            help="Named set of optimizer, learning rate, losses and augmentation: fast, or "
+            "paper (as published)."
+        ),
+    ] = "fast"
+    batch: Annotated[int, Option(help="Number of images in each training step.")] = 32
+    split: Annotated[
+        str,
+        Option(
+            help="Rounds of the dataset to evaluate on: test, or unseen (tracks that are kept for "
+            "tests)."
+        ),
+    ] = "test"
+    every: Annotated[
+        int,
+        Option(
+            help="Step between two evaluated frames: 1 evaluates all frames, 5 every fifth frame.",
+            min=1,
+        ),
+    ] = 5
     device: Annotated[
-        str, Option(help="Device: auto (a GPU if there is one), cpu, cuda or cuda:NUMBER.")
+        str,
+        Option(
+            help="Device to train on: auto (a GPU if there is one, else the CPU), cpu, cuda or "
+            "cuda:NUMBER."
+        ),
     ] = "auto"
-    threads: Annotated[int, Option(help="Number of CPU threads; 0: one per core.")] = 0
+    threads: Annotated[int, Option(help="Number of CPU threads; 0: one per CPU core.")] = 0
 
     def __post_init__(self) -> None:
         find_recipe(self.recipe)

@@ -14,27 +14,37 @@ class CalibrateConfig:
 
     inputs: Annotated[
         list[str],
-        Argument(help="A film of a drive, or pictures of a board (files, folders, patterns)."),
+        Argument(
+            help="Film of a drive, or pictures of a board or (with --drive) of a drive: files, "
+            "folders or wildcard patterns."
+        ),
     ]
     out: Annotated[Path, Option(help="Camera file to write.")] = Path("camera.yaml")
     board: Annotated[
         str,
         Option(
-            help="Board in the pictures: inner corners of a chessboard (9x6), or a ChArUco board "
-            "as charuco:5x7:4X4_50:0.75 (squares, dictionary, side of a marker in squares).",
-            show_default="a chessboard; its corners are counted",
+            help="Board in the pictures: the numbers of inner corners of a chessboard, for "
+            "example 9x6; or for a ChArUco board charuco:5x7:4X4_50:0.75 (numbers of "
+            "squares, ArUco dictionary, side of a marker divided by the side of a "
+            "square).",
+            show_default="the chessboard that most pictures show",
         ),
     ] = ""
     fisheye: Annotated[
-        bool, Option("--fisheye", help="The board was taken with a fisheye lens.")
+        bool, Option("--fisheye", help="The lens is a fisheye lens. Only for pictures of a board.")
     ] = False
     drive: Annotated[
-        bool, Option("--drive", help="The pictures are of a drive, in the order of time.")
+        bool,
+        Option(
+            "--drive",
+            help="The inputs are pictures of a drive in the order of time, not of a board.",
+        ),
     ] = False
     camera: Annotated[
         Path | None,
         Option(
-            help="Camera file that contains the lens, for example from a calibration with a board.",
+            help="For a drive: camera file from which the lens is taken, for example from a "
+            "calibration with a board.",
             show_default="none",
         ),
     ] = None
@@ -43,25 +53,33 @@ class CalibrateConfig:
         Option(
             "--fov-y-deg",
             "--fov",
-            help="Vertical field of view of the film or pictures, degrees.",
-            show_default="a guess: 65 degrees along the longer side",
+            help="For a drive: vertical field of view of the film or pictures, degrees. "
+            "--camera is used instead if both are given.",
+            show_default="the lens of --camera, --photo or the pictures' EXIF; else 65 degrees along "
+            "the longer side are assumed",
         ),
     ] = None
     photo: Annotated[
         Path | None,
         Option(
-            help="Photo of the same camera; its EXIF states the focal length.", show_default="none"
+            help="For a drive: JPEG photo of the same camera. The focal length is read from "
+            "its EXIF data, unless --camera or --fov-y-deg is given.",
+            show_default="none",
         ),
     ] = None
     lane_width_m: Annotated[
         float | None,
-        Option("--lane-width", help="Width of the lane driven in, m.", show_default="3.6, assumed"),
+        Option(
+            "--lane-width",
+            help="For a drive: width of the lane in which the car drives, m.",
+            show_default="3.6, assumed",
+        ),
     ] = None
     page: Annotated[
         Path | None,
         Option(
             "--report",
-            help="HTML page to write: pictures with the result drawn in.",
+            help="HTML page to write: pictures with the result drawn into them.",
             show_default="none",
         ),
     ] = None

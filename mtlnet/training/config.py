@@ -26,17 +26,24 @@ class TrainConfig:
     data: Annotated[
         Path,
         Option(
-            help="Dataset folder or, with --init, a folder of images with a labels.csv.",
+            help="Folder of a dataset or, with --init, a folder of images with labels.csv.",
             show_default="datasets/default",
         ),
     ]
-    out: Annotated[Path, Option(help="Folder of the run.", show_default="runs/DATE-RECIPE")]
+    out: Annotated[
+        Path,
+        Option(
+            help="Folder to write the model, its checkpoints and its curves to.",
+            show_default="runs/DATE-RECIPE",
+        ),
+    ]
     network: Annotated[
         str,
         Option(
-            help="Architecture: grid, grid_residual, mtl (the paper's), deepdriving, "
-            "mobilenet_v3_small or regnet_y_400mf.",
-            show_default="grid; mtl for --recipe paper",
+            help="Architecture of the network: grid, grid_residual (grid with six more "
+            "convolutions), mtl (the paper's), deepdriving (Chen et al. 2015), "
+            "mobilenet_v3_small or regnet_y_400mf (of torchvision).",
+            show_default="grid; mtl for --recipe paper; the model's with --init",
         ),
     ] = ""
     """A name of `mtlnet.architecture.ARCHITECTURES`."""
@@ -45,22 +52,27 @@ class TrainConfig:
         Option(
             parser=parse_alpha,
             metavar="TEXT",
-            help="Weights of the distance, angle and class losses; 0 leaves a task out.",
-            show_default="0.3,0.2,0.5; 1,1,0 for deepdriving",
+            help="Weights of the losses of the three tasks, as three numbers of 0 or more "
+            "separated by commas: distances, angle, class of the road. A task with weight "
+            "0 is not trained.",
+            show_default="0.3,0.2,0.5; 1,1,0 for deepdriving; the model's with --init",
         ),
     ] = (0.3, 0.2, 0.5)
     balance: Annotated[
         str,
         Option(
-            help="Method that sets the task weights: fixed (the values of --alpha), uncertainty or "
-            "dwa; uncertainty and dwa use --alpha only to select tasks."
+            help="Method that sets the weights of the tasks: fixed (the values of --alpha), "
+            "uncertainty (Kendall et al. 2018) or dwa (dynamic weight average, Liu et al. "
+            "2019). With uncertainty and dwa, --alpha only selects the tasks."
         ),
     ] = "fixed"
     recipe: Annotated[
         str,
         Option(
-            help="Training recipe: fast (minutes), paper (days); with --init: tune (fine-tune on "
-            "few images) or continue (hours on new frames).",
+            help="Named set of optimizer, learning rate, losses and augmentation: fast (takes "
+            "minutes) or paper (as published; takes days). With --init: tune (trains a "
+            "model further on few images) or continue (trains a model further for hours "
+            "on new frames).",
             show_default="fast; tune when --init is given",
         ),
     ] = "fast"
@@ -68,45 +80,61 @@ class TrainConfig:
         int | None,
         Option(
             help="Number of training steps.",
-            show_default="the recipe's; no limit when --minutes is given",
+            show_default="3,000 for fast, 150,000 for paper, 500 for tune, 30,000 for continue; no "
+            "limit when --minutes is given",
         ),
     ] = None
     minutes: Annotated[
         float | None,
         Option(
-            help="Duration of the training in minutes; the learning rate follows the elapsed time.",
+            help="Duration of the training, minutes. The learning rate then follows the "
+            "elapsed time instead of the number of steps.",
             show_default="no limit",
         ),
     ] = None
     init: Annotated[
         str | None,
         Option(
-            help="Model to start from: a run or a shipped model.",
-            show_default="none: random weights",
+            help="Model to train further: as for `mtlnet evaluate --model`.",
+            show_default="none: the weights are random at the start",
         ),
     ] = None
-    seed: Annotated[int, Option(help="Seed of all random numbers.")] = 0
-    batch: Annotated[int, Option(help="Images per step.", show_default="the recipe's")] = 0
+    seed: Annotated[int, Option(help="Seed of all random numbers, 0 or more.")] = 0
+    batch: Annotated[
+        int,
+        Option(
+            help="Number of images in each training step.",
+            show_default="64 for fast and continue (256 on a GPU), 32 for paper and tune",
+        ),
+    ] = 0
     rate_factor: float = 1.0
     """Factor by which the recipe's learning rate is multiplied: for a run started on a GPU, the
     result of `recipes.learning_rate_factor`. It is stored, so that a resumed run keeps its rate on
     any device."""
     device: Annotated[
-        str, Option(help="Device: auto (a GPU if there is one), cpu, cuda or cuda:NUMBER.")
+        str,
+        Option(
+            help="Device to train on: auto (a GPU if there is one, else the CPU), cpu, cuda or "
+            "cuda:NUMBER."
+        ),
     ] = "auto"
-    threads: Annotated[int, Option(help="Number of CPU threads.", show_default="one per core")] = 0
+    threads: Annotated[
+        int, Option(help="Number of CPU threads, 1 to 1024.", show_default="one per core")
+    ] = 0
     skip_undecodable: Annotated[
         bool,
         Option(
             "--skip-undecodable",
-            help="Leave out frames whose image cannot be decoded; the model's card lists them.",
+            help="Leave out frames whose image cannot be decoded, and list them in the model's "
+            "card.json. Without this option such a frame ends the training with an error.",
         ),
     ] = False
     hold_out_drives: Annotated[
         str,
         Option(
-            help="Drives of labels.csv to leave out of the training, separated by commas; "
-            "`mtlnet evaluate` reports them separately.",
+            help="Names of drives (column drive of labels.csv) whose images are left out of "
+            "the training, separated by commas. `mtlnet evaluate` reports the errors on "
+            "them separately.",
             show_default="none",
         ),
     ] = ""
@@ -114,7 +142,8 @@ class TrainConfig:
         bool,
         Option(
             "--change-data",
-            help="With --resume: allow --data to be another dataset than at the start of the run.",
+            help="With --resume: allow another dataset as --data than at the start of the "
+            "training.",
         ),
     ] = False
 
