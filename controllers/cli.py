@@ -14,7 +14,8 @@ app = typer.Typer(add_completion=False, rich_markup_mode="rich", no_args_is_help
 
 @app.callback()
 def controllers() -> None:
-    """Drive the simulated car with a controller, on the true state or on a model's perception."""
+    """Drive the simulated car with a controller, which receives the true state or a model's answers
+    to images."""
 
 
 for run in (drive, demo, compare, tune, train, record):

@@ -208,8 +208,8 @@ def predict_command(
     views: options.Views = 1,
     as_json: command.AsJson = False,
 ) -> None:
-    """Compute the track features of images, films, webcams, streams, rounds, Foxglove files or ROS 2
-    bags."""
+    """Compute the track features of images, films, webcams, streams, rounds, Foxglove files or
+    ROS 2 bags."""
     from rich.console import Console
 
     from mtlnet.evaluation.tables import prediction_table

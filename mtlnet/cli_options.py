@@ -302,7 +302,7 @@ LabelInsecure = Annotated[
     bool,
     typer.Option(
         "--insecure",
-        help="Require no token, even if --host is an address that other machines can reach.",
+        help="Allow that no token is set although other machines can reach --host.",
     ),
 ]
 ImportTable = Annotated[

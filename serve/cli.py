@@ -20,82 +20,120 @@ ServicePort = Annotated[int, typer.Option(help="Port of the running service.", m
 Model = Annotated[
     str,
     typer.Option(
-        help="A run's folder, its name in runs/, 'latest', or a shipped model: 'default', or "
+        help="Model to serve: the folder of a training, its name in runs/, 'latest' for the "
+        "newest training, or a model that is shipped with the project: 'default', or "
         "'varied' for real roads and lanes of 2.8 to 4.3 m."
     ),
 ]
 NewModel = Annotated[
     str | None,
-    typer.Option(help="Model to load, as for `serve --model`. Default: the current model again."),
+    typer.Option(
+        help="Model to load: as for `serve --model`. Default: the name of the present model is "
+        "looked up again and its files are read again."
+    ),
 ]
-Host = Annotated[str, typer.Option(help="Address to listen on. Default: this machine only.")]
+Host = Annotated[
+    str,
+    typer.Option(
+        help="Address to listen on. With the default, only this machine can reach the service. An "
+        "address that other machines can reach requires a token or --insecure."
+    ),
+]
 Port = Annotated[int, typer.Option(help="Port to listen on; 0: any free port.", min=0, max=65535)]
-RayPort = Annotated[int, typer.Option(help="Port of Ray's HTTP proxy.", min=1, max=65535)]
+RayPort = Annotated[
+    int, typer.Option(help="Port on which Ray's HTTP proxy listens.", min=1, max=65535)
+]
 Workers = Annotated[
     int,
-    typer.Option(help="Worker processes; each needs one core for its engine.", min=1, max=256),
+    typer.Option(
+        help="Number of worker processes; each needs one CPU core to compute answers.",
+        min=1,
+        max=256,
+    ),
 ]
-Replicas = Annotated[int, typer.Option(help="Engines; each uses one core of the cluster.", min=1)]
+Replicas = Annotated[
+    int,
+    typer.Option(
+        help="Number of replicas of the service; each uses one CPU core of the cluster.", min=1
+    ),
+]
 TokenFile = Annotated[
     Path | None,
     typer.Option(
-        help="File with the token that clients must send in the header Authorization: Bearer. "
-        "Default: the token in $DRIVERVIEW_TOKEN; if it is empty, no token is required."
+        help="File with the token that clients must send as the header Authorization: Bearer "
+        "TOKEN. Default: the token in $DRIVERVIEW_TOKEN; if it is empty, no token is "
+        "required."
     ),
 ]
 Insecure = Annotated[
     bool,
     typer.Option(
-        "--insecure", help="Serve other machines without a token, for example behind a proxy."
+        "--insecure",
+        help="Allow that no token is set although other machines can reach --host, for "
+        "example if a proxy protects the service.",
     ),
 ]
 RequestRate = Annotated[
     float,
     typer.Option(
-        help="Requests per second allowed from one client address, except from this machine; 0: no "
-        "limit.",
+        help="Largest number of requests per second from one client (an IPv4 address or an "
+        "IPv6 /64 network). Requests from this machine are not limited. 0: no limit.",
         min=0,
     ),
 ]
 Connections = Annotated[
-    int, typer.Option(help="Largest number of open connections.", min=1, max=65536)
+    int,
+    typer.Option(
+        help="Largest number of open connections of all clients together.", min=1, max=65536
+    ),
 ]
 AllowHost = Annotated[
     list[str] | None,
     typer.Option(
-        help="Host name that is accepted in requests if there is no token, in addition to "
-        "localhost and --host. Can be repeated."
+        help="Name that is accepted in the header Host of requests, in addition to localhost "
+        "and --host. If a token is required, every name is accepted. Can be repeated. "
+        "Default: none."
     ),
 ]
 TrustedProxy = Annotated[
     list[str] | None,
     typer.Option(
-        help="Address or network of a proxy whose header X-Forwarded-For is accepted as the "
-        "client's address. Can be repeated. Default: 127.0.0.1."
+        help="Address or network (such as 10.0.0.0/8) of a proxy. The address in the header "
+        "X-Forwarded-For of its requests counts as the client's address. Can be "
+        "repeated. Default: 127.0.0.1."
     ),
 ]
 BodyMib = Annotated[
     int,
-    typer.Option(help="MiB of memory for the bodies of all requests.", min=4, max=1 << 20),
+    typer.Option(
+        help="Memory for the bodies of all unanswered requests together, MiB.", min=4, max=1 << 20
+    ),
 ]
 CameraFiles = Annotated[
     list[str] | None,
     typer.Option(
         "--camera",
         metavar="NAME=FILE",
-        help="Camera that requests can select with the header X-Camera: NAME; FILE is its "
-        "camera.yaml. Can be repeated. Default: the model's camera only.",
+        help="Further camera: a request with the header X-Camera: NAME contains an image of "
+        "the camera that FILE (camera.yaml) describes. Can be repeated. Default: the "
+        "model's camera only.",
     ),
 ]
 Views = Annotated[
     int,
     typer.Option(
-        help="Number of views of each image whose answers are averaged: 1; 2 (and mirrored: errors "
-        "a tenth smaller); 6 (and turned left and right). The time is proportional to it."
+        help="Number of views of each image whose answers are averaged. 1: the image alone; "
+        "2: also its mirror image (errors about a tenth smaller than with 1); 6: also "
+        "both of these turned to the left and to the right. The time is proportional to "
+        "the number of views."
     ),
 ]
 LogAnswers = Annotated[
-    bool, typer.Option("--log-answers", help="Log answered requests, not only refused ones.")
+    bool,
+    typer.Option(
+        "--log-answers",
+        help="Log every answered request; without this option only refused requests are logged.",
+    ),
 ]
 
 
@@ -121,8 +159,8 @@ def serve(
 
     The first line on stderr shows the model and the service's URL. Send an image with
     [bold]curl -H "Content-Type: image/jpeg" --data-binary @frame.jpg URL/features[/bold].
-    The API documentation is at URL/docs. SIGTERM or Ctrl-C stops the service, SIGHUP reloads the
-    model.
+    The documentation of the API is at URL/docs. SIGTERM or Ctrl-C stops the service, SIGHUP reads
+    the model's files again.
     """
     if context.invoked_subcommand is not None:
         _check_no_options(context)
@@ -158,10 +196,11 @@ def _check_no_options(context: typer.Context) -> None:
 
 @app.command()
 def reload(port: ServicePort = ServiceConfig.port, model: NewModel = None) -> None:
-    """Load new weights into the service that runs on this machine; no request is lost.
+    """Load another model, or new weights, into the service that runs on this machine; no request
+    is lost.
 
-    Every worker loads and checks the new weights while it still answers with the old ones. If the
-    check fails, the old weights stay in use and this command prints the reason.
+    Every worker process loads and checks the new model while it still answers with the old one. If
+    the check fails, the old model stays in use and this command prints the reason.
     """
     from serve.workers.control_socket import send_command
 
@@ -172,7 +211,8 @@ def reload(port: ServicePort = ServiceConfig.port, model: NewModel = None) -> No
 
 @app.command()
 def restart(port: ServicePort = ServiceConfig.port) -> None:
-    """Replace the workers of the running service one by one; no request is lost."""
+    """Replace the worker processes of the service that runs on this machine, one after the other;
+    no request is lost."""
     from serve.workers.control_socket import send_command
 
     typer.echo(send_command(port, "restart"))
@@ -188,7 +228,10 @@ def ray(
     insecure: Insecure = False,
     allow_host: AllowHost = None,
 ) -> None:
-    """Serve on Ray: on the cluster at $RAY_ADDRESS, or on a new local cluster.
+    """Serve a model over HTTP with Ray Serve.
+
+    Ray's cluster is the cluster at $RAY_ADDRESS or, if this variable is not set, a new cluster on
+    this machine.
 
     Requires [bold]pip install 'driverview\\[rayserve]'[/bold]. The model's folder must exist on all
     machines of the cluster.

@@ -19,7 +19,8 @@ from simulator.track.cli import Lanes, TrackName, TracksDir, Traffic, tracks
 from simulator.watch.cli import watch
 
 app = typer.Typer(
-    help="VTORCS: tracks, physics, traffic, sensors and camera.",
+    help="Simulator of a car on roads with lane markings: tracks, physics, other cars, "
+    "sensors and camera.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="rich",
@@ -32,10 +33,16 @@ app.add_typer(tracks, name="tracks")
 def centreline(
     track: TrackName,
     out: Annotated[Path, typer.Option(help="CSV file to write.")],
-    step: Annotated[float, typer.Option(help="Distance between rows, m.")] = 1.0,
+    step: Annotated[
+        float, typer.Option(help="Distance between two rows along the centre line, m.")
+    ] = 1.0,
     tracks_dir: TracksDir = None,
 ) -> None:
-    """Write a track's centre line as CSV: s, x, y, z, ang, curv (m, rad, 1/m)."""
+    """Write the centre line of a track as a CSV file.
+
+    Columns: s (distance from the start line along the centre line, m), x, y, z (position, m), ang
+    (direction of the track in the x-y plane, rad), curv (curvature, 1/m, positive in a left bend).
+    """
     from simulator.track.catalogue import find_track
     from simulator.track.centre_line_csv import write_centre_line
 
@@ -50,31 +57,64 @@ def snapshot(
     lanes: Lanes = 2,
     lane_width: Annotated[
         float | None,
-        typer.Option(help="Lane width, m, 2.7 to 4.5. Default: 4.0, random on varied roads."),
+        typer.Option(
+            help="Width of the lanes, m, 2.7 to 4.5. Only with --roads paper. Default: 4.0; with "
+            "--roads varied it is random."
+        ),
     ] = None,
     roads: Annotated[
-        str, typer.Option(help="paper, or varied: random lanes, paint and look, by --seed.")
+        str,
+        typer.Option(
+            help="Kind of the road. paper: lanes of 4.0 m and the track's own lane markings; "
+            "varied: width of the lanes, shoulders, lane markings and surface are random, "
+            "determined by --seed."
+        ),
     ] = "paper",
-    seed: Annotated[int, typer.Option(help="Seed of scenery, light and viewpoints.", min=0)] = 0,
-    traffic: Traffic = 3,
+    seed: Annotated[
+        int,
+        typer.Option(
+            help="Seed of the scenery, the details of the light and the positions of the car.",
+            min=0,
+        ),
+    ] = 0,
+    traffic: Annotated[
+        int, typer.Option(help="Number of other cars ahead in each view.", min=0, max=12)
+    ] = 3,
     light: Annotated[
-        str | None, typer.Option(help="Kind of light, such as rain. Default: all, in turn.")
+        str | None,
+        typer.Option(
+            help="Light and weather in all views: clear, overcast, dusk, fog, heavy-shadow, rain "
+            "or snow. Default: every second view is in clear light, the remaining views are "
+            "in the other kinds of light in turn."
+        ),
     ] = None,
     view: Annotated[
         str | None,
-        typer.Option(help="front, left, right, rear, chase or top. Default: mostly front."),
+        typer.Option(
+            help="Direction of all views: front, left, right, rear, chase (from behind the car) "
+            "or top (from above). Default: 14 views front, one chase and one top."
+        ),
     ] = None,
-    kind: Annotated[str, typer.Option(help="Kind of image: colour, depth or class.")] = "colour",
+    kind: Annotated[
+        str,
+        typer.Option(
+            help="Kind of the images: colour, depth (distances as colours) or class (kinds of objects "
+            "as colours)."
+        ),
+    ] = "colour",
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="Camera file of driverview, OpenCV, ROS or Kalibr: render through its lens."
+            help="Camera file of driverview, OpenCV, ROS or Kalibr; the images are rendered "
+            "through its lens. Default: the camera of the shipped models."
         ),
     ] = None,
     tracks_dir: TracksDir = None,
 ) -> None:
-    """Write a sheet of camera views with the true markings drawn on them, or of depth or class
-    images."""
+    """Write a PNG file with 16 camera views along a track.
+
+    On colour images the right half shows the true lane markings, drawn over the painted ones.
+    """
     from runtime.camera_file import read_camera
     from simulator.camera.snapshot import write_contact_sheet
     from simulator.track.catalogue import find_track

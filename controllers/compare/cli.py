@@ -14,10 +14,13 @@ TERMINAL_WIDTH = 120  # columns that the tables need
 
 @options(CompareConfig)
 def compare(config: CompareConfig, as_json: bool) -> None:
-    """Drive every controller on every track and print a table of the scores, as in the paper.
+    """Drive every controller on every track and print a table of the scores per control step.
 
-    The cars drive on one lane, from a standing start, with throttle 0.2 in gear 1. The same command
-    continues an interrupted comparison: it skips the drives whose results are in the folder.
+    The drives are made as in the paper (Li et al., "Reinforcement Learning and Deep Learning based
+    Lateral Control for Autonomous Driving"): on roads with one lane, from a standing start, with
+    throttle 0.2 in gear 1. The score of a drive is the sum of the paper's rewards over its control
+    steps. To continue an interrupted comparison, run the same command again: it skips the drives
+    whose results are in the folder.
     """
     from controllers.compare.report import write_report
     from controllers.compare.run import compare as run
@@ -34,11 +37,12 @@ def compare(config: CompareConfig, as_json: bool) -> None:
 
 @options(TuneConfig)
 def tune(config: TuneConfig, as_json: bool) -> None:
-    """Search for the best parameters of controllers, with the same number of drives for each
-    controller.
+    """Search for the parameters with which controllers get the highest reward.
 
-    The file with the found parameters is read by `controllers drive --parameters` and `controllers
-    compare --parameters`. The same command continues an interrupted search.
+    Each controller makes the same number of drives. The parameters that were found are written to a
+    file, which `controllers drive --parameters` and `controllers compare --parameters` read. To
+    continue an interrupted search, run the same command again. "The paper" is Li et al.,
+    "Reinforcement Learning and Deep Learning based Lateral Control for Autonomous Driving".
     """
     from controllers.compare.tune import tune as run
 

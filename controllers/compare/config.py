@@ -13,30 +13,35 @@ from controllers import cli_options as options
 class CompareConfig:
     """A comparison: every controller on every track, with every perception and seed."""
 
-    out: Annotated[Path, "Folder for results.json and report.html."] = Path("comparison")
+    out: Annotated[Path, "Folder to write results.json and report.html to."] = Path("comparison")
     tracks: options.Tracks = "forza,alpine-2,eroad,g-track-3"
     controllers: options.Controllers = "lqr,lqr-preview,mpc,mpc-preview,torcs"
     perceptions: Annotated[
-        str, "Perceptions, separated by commas: truth, model or addresses of services."
+        str,
+        "Sources of the state that the controllers receive, separated by commas: truth "
+        "(the simulator's exact state), model (the answers of --model to rendered "
+        "images), or addresses of services that answer the images.",
     ] = "truth"
     seeds: Annotated[
         int,
         "Number of times that each drive is repeated, with the seeds 0, 1, ... The seed "
-        "changes images and disturbances. Drives with neither are all equal.",
+        "changes the images and the disturbances; without images and disturbances all "
+        "repetitions are equal.",
     ] = 1
     disturb: Annotated[
         bool,
         Option(
             "--disturb",
-            help="Add drives with sensor noise, delay, wind, and changed friction, mass and tyre "
-            "stiffness.",
+            help="Add drives with a disturbance, for each kind: sensor noise, delay, side "
+            "wind, changed friction, mass and tyre stiffness.",
         ),
     ] = False
     steps: options.Steps = None
     start_d: Annotated[
         float | None,
-        "Start, m left of the track's centre. Default: TORCS's position on the starting "
-        "grid, a sixth of the track's width to the right.",
+        "Start of the car, m to the left of the track's centre (negative: to the right). "
+        "Default: the first position on the starting grid in TORCS, which is a sixth of "
+        "the track's width to the right of the centre.",
     ] = None
     latency_ms: options.Latency = 0.0
     drop: options.Drop = 0.0
@@ -52,7 +57,7 @@ class TuneConfig:
     """A search for the parameters of several controllers, with the same number of drives for each
     controller."""
 
-    out: Annotated[Path, "File for the parameters found."] = Path("tuned.json")
+    out: Annotated[Path, "JSON file to write the parameters to."] = Path("tuned.json")
     controllers: Annotated[
         str,
         "Controllers, separated by commas: lqr, lqr-preview, lqr-paper, "
@@ -61,13 +66,17 @@ class TuneConfig:
     tracks: options.Tracks = "forza"
     budget: Annotated[
         int,
-        "Number of drives of each controller on each track. The first drive has the controller's "
-        "own parameters.",
+        "Number of parameter sets that are tried for each controller, with one drive on "
+        "each track. The first set contains the controller's own parameters.",
     ] = 40
     reward: options.Reward = "paper"
     steps: options.Steps = None
     disturbance: Annotated[
-        str, "Disturbance of the drives: none, noise, delay, wind, friction, mass or stiffness."
+        str,
+        "Disturbance in all drives: none, noise (of the sensors), delay (of the state), "
+        "wind (from the side), or changed friction, mass or stiffness (of the tyres).",
     ] = "none"
-    seed: Annotated[int, Option(help="Seed of the candidates and the disturbance.", min=0)] = 0
+    seed: Annotated[
+        int, Option(help="Seed of the random parameter sets and of the disturbance.", min=0)
+    ] = 0
     tracks_dir: options.TracksDir = None

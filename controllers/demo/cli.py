@@ -11,11 +11,11 @@ from runtime import cli as command
 
 @options(DemoConfig)
 def demo(config: DemoConfig, as_json: bool) -> None:
-    """Show the shipped model on a first drive, then run the whole pipeline: collect, train,
-    evaluate, serve, predict, drive, and an HTML report.
+    """Run all steps of the project: a film of the shipped model's answers, then collect, train,
+    evaluate, serve, drive, and an HTML report.
 
-    The same command continues an interrupted demo. The exit code is 1 when a result of the trained
-    model misses its limit.
+    To continue an interrupted demo, run the same command again. The exit code is 1 if a result of
+    the trained model, for example an error, misses the limit that the demo sets for it.
     """
     from controllers.demo.process import stop_on_sigterm
     from controllers.demo.report import check_limits, print_tables, write_report

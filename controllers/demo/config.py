@@ -14,16 +14,24 @@ from trackfeatures.errors import UserError
 class DemoConfig:
     """What the demo collects and how long it trains; the defaults take 17 minutes on two cores."""
 
-    out: Annotated[Path, "Folder for all results."] = Path("demo")
-    rounds: Annotated[int, Option(help="Number of rounds to collect.", min=12)] = 300
-    frames: Annotated[int, Option(help="Frames per round.", min=20)] = 200
-    minutes: Annotated[float, Option(help="Training time, minutes.", min=0.1)] = 8.5
-    seed: Annotated[int, Option(help="Seed of the collection and of the training.", min=0)] = 1
+    out: Annotated[Path, "Folder to write all results to."] = Path("demo")
+    rounds: Annotated[
+        int,
+        Option(
+            help="Number of rounds (recorded drives) to collect for training and testing.", min=12
+        ),
+    ] = 300
+    frames: Annotated[int, Option(help="Number of frames in each round.", min=20)] = 200
+    minutes: Annotated[float, Option(help="Duration of the training, minutes.", min=0.1)] = 8.5
+    seed: Annotated[
+        int, Option(help="Seed of all random choices of the collection and of the training.", min=0)
+    ] = 1
     first_drive: Annotated[
         bool,
         Option(
             "--first-drive",
-            help="Stop after the first step, a film of the shipped model's answers.",
+            help="Stop after the first step: a short drive that is recorded, and a film of it "
+            "with the answers of the shipped model.",
         ),
     ] = False
 

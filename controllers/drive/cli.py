@@ -18,11 +18,13 @@ if TYPE_CHECKING:
 
 @options(DriveConfig)
 def drive(config: DriveConfig, as_json: bool) -> None:
-    """Drive in closed loop, from rest 25 m before the start line, and print the score.
+    """Drive a controller in closed loop, from rest 25 m before the start line, and print the score.
 
-    Gear 1 and the throttle are held, with less throttle behind slower traffic; --speed replaces
-    both. The score is the sum of the rewards over the requested steps. The drive ends early when
-    the car leaves the track, turns round, rolls backwards or collides.
+    The car stays in gear 1 with a constant throttle, which is reduced behind slower cars. With
+    --speed the car holds a speed instead. The score is the sum of the paper's rewards (Li et al.,
+    "Reinforcement Learning and Deep Learning based Lateral Control for Autonomous Driving") over
+    the number of control steps of --steps. The drive ends early when the car leaves the track,
+    turns round, rolls backwards or collides.
     """
     from rich.console import Console
 

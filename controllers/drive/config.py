@@ -21,19 +21,25 @@ class DriveConfig:
     lanes: Annotated[int, "Number of lanes, 1 to 3."] = 1
     perception: Annotated[
         str,
-        "Perception: truth (the exact state), model, or the address of a service, e.g. "
-        "http://127.0.0.1:8000.",
+        "Source of the state that the controller receives: truth (the simulator's exact state), "
+        "model (the answers of --model to rendered images), or the address of a service that "
+        "answers the images, for example http://127.0.0.1:8000.",
     ] = "truth"
     steps: options.Steps = None
-    log: Annotated[Path | None, "CSV file for the state and the steering of each step."] = None
-    video: Annotated[Path | None, "File for a film of the drive (.mp4)."] = None
+    log: Annotated[
+        Path | None,
+        "CSV file to write the state of the car and the steering of each control step to. "
+        "Default: none.",
+    ] = None
+    video: Annotated[Path | None, "MP4 file to write a film of the drive to. Default: none."] = None
     watch: Annotated[
         int | None,
         Option(
             metavar="PORT",
             min=0,
             max=65535,
-            help="Show the drive in the browser in real time, at this port; 0: any free port.",
+            help="Show the drive in the browser in real time, at this port; 0: any free port. "
+            "Default: it is not shown.",
         ),
     ] = None
     latency_ms: options.Latency = 0.0
@@ -42,8 +48,8 @@ class DriveConfig:
         bool,
         Option(
             "--realtime",
-            help="Drive on the wall clock, without waiting for the perception's answers. "
-            "The result differs from drive to drive.",
+            help="Drive on the wall clock, without waiting for the answers of the model or "
+            "service. The result differs from drive to drive.",
         ),
     ] = False
     parameters: options.Parameters = None
@@ -51,24 +57,30 @@ class DriveConfig:
     views: options.Views = 1
     start_d: Annotated[
         float | None,
-        "Start, m left of the track's centre. Default: the centre of --target-lane, or 0.",
+        "Start of the car, m to the left of the track's centre (negative: to the right). "
+        "Default: the centre of --target-lane, or 0 without --target-lane.",
     ] = None
     target_lane: Annotated[
-        int | None, "Lane to follow, 0 is the leftmost. Default: the lane nearest to the start."
+        int | None,
+        "Number of the lane to follow; 0 is the leftmost. Default: the lane nearest to the start.",
     ] = None
     throttle: Annotated[
         float | None,
-        f"Constant throttle, 0 to 1, in gear 1. Default: {THROTTLE}. Not with --speed, which "
-        "controls the throttle.",
+        f"Constant throttle, 0 to 1, in gear 1. Default: {THROTTLE}. Not with --speed, "
+        "which controls the throttle.",
     ] = None
     speed: Annotated[
         float | None,
-        "Speed to hold, m/s, 1 to 40; the car slows down in bends and behind traffic. Default: the "
-        "throttle is constant.",
+        "Speed to hold, m/s, 1 to 40; the car slows down in bends and behind slower "
+        "cars. Default: the throttle is constant instead.",
     ] = None
     traffic: Annotated[int, "Number of other cars, 0 to 12."] = 0
     light: options.Light = "clear"
     seed: Annotated[
-        int, Option(help="Seed of traffic, scenery, light and lost answers.", min=0)
+        int,
+        Option(
+            help="Seed of the traffic, the scenery, the details of the light and the lost answers.",
+            min=0,
+        ),
     ] = 0
     tracks_dir: options.TracksDir = None

@@ -52,7 +52,9 @@ class RecordConfig:
     model: Annotated[str, f"Model on whose answers the car drives: {options.MODELS}"] = "default"
     rounds: Rounds = 12
     frames: Frames = CollectConfig.frames
-    out: Annotated[Path, "Dataset folder; an unfinished dataset is continued."] = FOLDER
+    out: Annotated[Path, "Dataset folder to write; an unfinished dataset in it is continued."] = (
+        FOLDER
+    )
     seed: Seed = FIRST_SEED
     workers: Workers = 0
     tracks: Tracks = ""
@@ -69,10 +71,11 @@ class RecordConfig:
 def record(config: RecordConfig, as_json: bool) -> None:
     """Record rounds with true labels while a controller steers on a model's answers.
 
-    The rounds are planned like the rounds of `datagen collect`, with the same speeds and traffic.
-    The controller follows the trajectory of a round, which sways and leaves the lane. A car that
-    leaves the road or hits something is put back onto the road. The same command continues an
-    interrupted dataset.
+    A round is one recorded drive, with its images and labels in one file. The rounds are planned
+    like the rounds of `datagen collect`, with the same speeds and traffic. The controller follows
+    the planned path of a round, which sways and also leaves the lane. A car that leaves the road or
+    hits something is put back onto the road. To continue an interrupted dataset, run the same
+    command again.
     """
     from controllers.record.law import MakePerceivedLaw
 

@@ -11,10 +11,13 @@ from trackfeatures.errors import UserError
 
 @options(TrainConfig)
 def train(config: TrainConfig, as_json: bool) -> None:
-    """Train an actor to steer by reinforcement learning; drive it with `--controller OUT`.
+    """Train an actor, a network that computes the steering, by reinforcement learning.
 
-    At each evaluation the present actor drives without noise, and the best actor is kept. The same
-    command, or --resume, continues an interrupted training.
+    At intervals (--evaluate-every) the present actor is evaluated in drives without exploration
+    noise; the actor with the highest reward is kept. `controllers drive --controller OUT` drives
+    with it. To continue an interrupted training, run the same command again, or with
+    --resume. "The paper" is Li et al., "Reinforcement Learning and Deep Learning based Lateral
+    Control for Autonomous Driving".
     """
     from rich.markup import escape
 

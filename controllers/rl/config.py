@@ -133,35 +133,48 @@ ALL_TRACKS = "all"
 class TrainConfig:
     """One training. Equal configurations give equal actors, bit for bit."""
 
-    out: Annotated[Path, "Folder for the actor, its curves and its checkpoint."] = Path("runs/rl")
-    algorithm: Annotated[str, f"Algorithm: {', '.join(ALGORITHMS)} or {PPO}."] = "ddpg"
+    out: Annotated[Path, "Folder to write the actor, its curves and its checkpoint to."] = Path(
+        "runs/rl"
+    )
+    algorithm: Annotated[str, f"Algorithm of the training: {', '.join(ALGORITHMS)} or {PPO}."] = (
+        "ddpg"
+    )
     envs: Annotated[
         int | None,
-        Option(help="Cars that drive at once. Default: 256 with ppo, otherwise 1.", min=1),
+        Option(
+            help="Number of cars that drive at the same time. Default: 256 with ppo, otherwise 1.",
+            min=1,
+        ),
     ] = None
     track: Annotated[
         str | None,
-        "Name of a track (`simulator tracks`), or its file. With several cars also all: half of "
-        "the cars drive on all tracks, half on random roads. Default: forza with one car, "
-        "otherwise all.",
+        "Name of a track (`simulator tracks` lists the names), or its file. Only with "
+        "several cars also: all; then half of the cars drive on all tracks in turn, and "
+        "half of the cars on random roads. Default: forza with one car, otherwise all.",
     ] = None
     seed: Annotated[int, Option(help="Seed of all random numbers of the training.", min=0)] = 0
     steps: Annotated[
         int | None,
         Option(
-            help="Control steps of 50 ms of all cars together. Default: 400,000 with one car, "
-            "otherwise 20,000,000.",
+            help="Number of control steps of 50 ms of all cars together. Default: 400,000 with "
+            "one car, otherwise 20,000,000.",
             min=1,
         ),
     ] = None
-    state: Annotated[str, "State that the actor receives: paper, history, stacked or residual."] = (
-        "paper"
-    )
+    state: Annotated[
+        str,
+        "State that the actor receives. paper: offset, angle, speeds and class of the "
+        "road. history: the paper's state, and its changes over the last seven steps. "
+        "stacked: the numbers of paper, the yaw rate, the changes of offset and angle, "
+        "and the last two actions. residual: the numbers of stacked and the steering of "
+        "lqr, to which the actor adds a correction. With several cars or ppo only paper "
+        "and history are possible.",
+    ] = "paper"
     disturbed: Annotated[
         float,
         Option(
-            help="With several cars: share of the cars that have random friction, mass and "
-            "throttle in each episode, and noise and delay on their state.",
+            help="With several cars: share of the cars, 0 to 1, that have random friction, "
+            "mass and throttle in each episode, and noise and delay on their state.",
             min=0.0,
             max=1.0,
         ),
@@ -170,41 +183,53 @@ class TrainConfig:
         bool,
         Option(
             "--image-errors",
-            help="With several cars: the offset and the angle in the states of all cars that are "
-            "not disturbed have errors like those of the model on images, also in evaluations.",
+            help="With several cars: add errors like those of a model in drives on images "
+            "(standard deviations 0.022 m and 0.009 rad) to the offset and the angle in "
+            "the states of all cars that are not disturbed (--disturbed), also in "
+            "evaluations.",
         ),
     ] = False
     state_noise: Annotated[
         float | None,
-        "Standard deviation of the noise on the paper's state. Default: "
-        f"{_defaults('state_noise')}.",
+        "Standard deviation of the noise on each number of the state, without unit: the "
+        "offset is divided by half of the track's width, the angle by pi and the speeds "
+        f"by 75 km/h. Default: {_defaults('state_noise')}.",
     ] = None
     actor_rate: Annotated[
-        float | None, f"Learning rate of the actor. Default: {_defaults('actor_rate')}."
+        float | None,
+        f"Learning rate of the actor, above 0. Default: {_defaults('actor_rate')}.",
     ] = None
     critic_rate: Annotated[
-        float | None, f"Learning rate of the critics. Default: {_defaults('critic_rate')}."
+        float | None,
+        "Learning rate of the critics, which estimate the value of a state in the "
+        f"training, above 0. Default: {_defaults('critic_rate')}.",
     ] = None
     reward: options.Reward = "paper"
     evaluate_every: Annotated[
         int | None,
         Option(
-            help="Steps between two evaluations; a checkpoint is written after each. Default: "
-            "20,000 with one car, otherwise 1,000,000.",
+            help="Number of control steps of all cars together between two evaluations; a "
+            "checkpoint is written after each evaluation. Default: 20,000 with one car, "
+            "otherwise 1,000,000.",
             min=1,
         ),
     ] = None
     threads: Annotated[
         int,
         Option(
-            help="Number of threads that move several cars and train the networks of ppo. The "
-            "trained actor does not depend on this number.",
+            help="Number of threads that simulate several cars and train the networks of ppo. "
+            "The trained actor does not depend on this number.",
             min=1,
         ),
     ] = 2
     tracks_dir: options.TracksDir = None
     resume: Annotated[
-        bool, Option("--resume", help="Continue the training in --out with its own options.")
+        bool,
+        Option(
+            "--resume",
+            help="Continue the interrupted training in --out with the options with which it was "
+            "started; only --threads can be changed.",
+        ),
     ] = False
 
     @property

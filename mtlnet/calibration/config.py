@@ -55,8 +55,8 @@ class CalibrateConfig:
             "--fov",
             help="For a drive: vertical field of view of the film or pictures, degrees. "
             "--camera is used instead if both are given.",
-            show_default="the lens of --camera, --photo or the pictures' EXIF; else 65 degrees along "
-            "the longer side are assumed",
+            show_default="of --camera, --photo or the pictures' EXIF; else assumed: 65 degrees "
+            "along the longer side",
         ),
     ] = None
     photo: Annotated[

@@ -17,9 +17,19 @@ from runtime.options import options_of
 from simulator.link.config import LinkConfig
 from trackfeatures.errors import UserError
 
-CameraSize = Annotated[str, typer.Option(help="Image size in pixels, such as 280x210, or none.")]
+CameraSize = Annotated[
+    str,
+    typer.Option(
+        help="Size of the camera images as WIDTHxHEIGHT in pixels, for example 280x210; none: no "
+        "images."
+    ),
+]
 Header = Annotated[
-    Path | None, typer.Option(help="Write the C header of the memory to this file and end.")
+    Path | None,
+    typer.Option(
+        help="File to write the C header with the layout of the shared memory to; the command "
+        "then ends without a server. Default: none."
+    ),
 ]
 
 
@@ -30,8 +40,9 @@ def link(
     """Run the simulator for a client in another process, written in C, Python or any other
     language.
 
-    A client sends a reset, then one command per control step (see driverview_link.h). Ctrl-C,
-    SIGTERM or a client's QUIT request ends the server.
+    The client and the simulator exchange data over shared memory. A client sends a reset, then one
+    command for each control step; the C header that --header writes describes them. Ctrl-C, SIGTERM
+    or a client's request QUIT ends the server.
     """
     if header is not None:
         _write_header(header)

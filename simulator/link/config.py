@@ -16,36 +16,57 @@ DEFAULT_NAME = "/driverview"
 class LinkConfig:
     """The options of one link server."""
 
-    track: Annotated[str, Option(help="Name of a track, or a track file.")] = "circuit"
-    name: Annotated[str, Option(help="Name of the shared memory, such as /driverview.")] = (
-        DEFAULT_NAME
-    )
+    track: Annotated[
+        str, Option(help="Name of a track (`simulator tracks` lists the names), or its file.")
+    ] = "circuit"
+    name: Annotated[
+        str,
+        Option(
+            help="Name of the shared memory through which the client and the simulator exchange data. "
+            "It begins with a slash."
+        ),
+    ] = DEFAULT_NAME
     lanes: Lanes = 1
     lane_width: LaneWidth = LANE_WIDTH_M
     traffic: Traffic = 0
     frequency_hz: Annotated[
-        int, Option("--frequency", help="Control steps per second; a divisor of 200.")
+        int, Option("--frequency", help="Number of control steps per second, a divisor of 200.")
     ] = 20
     seed: Annotated[
-        int, Option(help="Seed of scenery and light, and of resets without a seed.", min=0)
+        int,
+        Option(
+            help="Seed of the scenery, of the details of the light, and of each reset for which "
+            "the client gives no seed.",
+            min=0,
+        ),
     ] = 0
     picture: tuple[int, int] = (0, 0)
     """Width and height of the camera images in px; (0, 0): no images."""
-    light: Annotated[str, Option(help="Light of the images, such as clear or rain.")] = "clear"
+    light: Annotated[
+        str,
+        Option(
+            help="Light and weather in the images: clear, overcast, dusk, fog, heavy-shadow, rain or "
+            "snow."
+        ),
+    ] = "clear"
     tracks_dir: TracksDir = None
     realtime: Annotated[
         bool,
         Option(
             "--realtime/--lock-step",
-            help="Step by the wall clock and hold the last command, or wait for a command before "
-            "each step.",
+            help="--realtime: control steps follow the wall clock, and the last command is "
+            "held until a new one arrives. --lock-step: each control step waits for a "
+            "command.",
         ),
     ] = False
-    once: Annotated[bool, Option("--once", help="End when the first client disconnects.")] = False
+    once: Annotated[
+        bool, Option("--once", help="End the server when its first client disconnects.")
+    ] = False
     patience_s: Annotated[
         float,
         Option(
             "--patience",
-            help="Longest wait for a client's command, s; then the server ends. 0: no limit.",
+            help="Longest time without a command from a connected client, s, after which the "
+            "server ends. 0: no limit.",
         ),
     ] = 600.0

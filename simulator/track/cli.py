@@ -15,14 +15,22 @@ if TYPE_CHECKING:
     from simulator.track.geometry import Track
 
 TrackName = Annotated[
-    str, typer.Argument(help="Name of a track, random:SEED, or a .xml, .toml or .csv file.")
+    str,
+    typer.Argument(
+        help="Name of a track (`simulator tracks` lists the names), random:SEED for a random "
+        "road, or a .xml, .toml or .csv file."
+    ),
 ]
 TracksDir = Annotated[
-    Path | None, typer.Option(help="A further folder to search for TORCS, .toml or .csv tracks.")
+    Path | None,
+    typer.Option(
+        help="Further folder in which tracks are looked up: .xml files of TORCS, .toml or .csv "
+        "files. Default: none."
+    ),
 ]
 
 Lanes = Annotated[int, typer.Option(help="Number of lanes, 1 to 3.")]
-LaneWidth = Annotated[float, typer.Option(help="Lane width, m, 2.7 to 4.5.")]
+LaneWidth = Annotated[float, typer.Option(help="Width of the lanes, m, 2.7 to 4.5.")]
 Traffic = Annotated[int, typer.Option(help="Number of other cars.", min=0, max=12)]
 
 tracks = typer.Typer(rich_markup_mode="rich")
@@ -32,9 +40,11 @@ tracks = typer.Typer(rich_markup_mode="rich")
 def list_all(
     context: typer.Context,
     tracks_dir: TracksDir = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the list as JSON on stdout.")
+    ] = False,
 ) -> None:
-    """List all tracks that can be driven, plot one, or export a random road."""
+    """List all tracks that can be driven. The subcommands plot a track or export a random road."""
     if context.invoked_subcommand is not None:
         context.obj = tracks_dir
         return
@@ -52,11 +62,15 @@ def list_all(
 def plot(
     context: typer.Context,
     track: TrackName,
-    out: Annotated[Path | None, typer.Option(help="PNG file to write. Default: NAME.png.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="PNG file to write. Default: NAME.png in the working folder."),
+    ] = None,
     lanes: Lanes = 1,
     tracks_dir: TracksDir = None,
 ) -> None:
-    """Draw a track as PNG: its plan, and height, curvature and class of the road along the lap."""
+    """Draw a track as a PNG file: its plan, and height, curvature and class of the road along the
+    lap."""
     from simulator.track.catalogue import find_track
     from simulator.track.plot import write_plot
     from simulator.track.road import Road
@@ -70,10 +84,16 @@ def plot(
 @tracks.command()
 def export(
     road: Annotated[
-        str, typer.Argument(metavar="random:SEED", help="Name of a random road: random:SEED.")
+        str,
+        typer.Argument(
+            metavar="random:SEED",
+            help="Name of a random road: random: and a whole number, the seed, which determines "
+            "the road; for example random:7.",
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="TOML file to write. Default: random-SEED.toml.")
+        Path | None,
+        typer.Option(help="TOML file to write. Default: random-SEED.toml in the working folder."),
     ] = None,
 ) -> None:
     """Write a random road as a TOML file; commands accept the file's path as a track."""

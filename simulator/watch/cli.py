@@ -24,16 +24,31 @@ FREQUENCY_HZ: Final = 20
 class WatchConfig:
     """The options of `simulator watch`."""
 
-    track: Annotated[str, Option(help="Name of a track, or its file.")] = "circuit"
+    track: Annotated[
+        str, Option(help="Name of a track (`simulator tracks` lists the names), or its file.")
+    ] = "circuit"
     lanes: Lanes = 1
     traffic: Traffic = 0
-    light: Annotated[str, Option(help="Kind of light, such as overcast or rain.")] = "clear"
-    host: Annotated[str, Option(help="Address to listen on.")] = "127.0.0.1"
-    port: Annotated[int, Option(help="Port to listen on; 0: any free port.", min=0, max=65535)] = (
+    light: Annotated[
+        str,
+        Option(help="Light and weather: clear, overcast, dusk, fog, heavy-shadow, rain or snow."),
+    ] = "clear"
+    host: Annotated[
+        str,
+        Option(
+            help="Address on which the page is served. With the default, only this machine can reach "
+            "it."
+        ),
+    ] = "127.0.0.1"
+    port: Annotated[int, Option(help="Port of the page; 0: any free port.", min=0, max=65535)] = (
         8765
     )
-    speed: Annotated[float, Option(help="Speed of the drive as a multiple of real time.")] = 1.0
-    seed: Annotated[int, Option(help="Seed of scenery, light and traffic.", min=0)] = 0
+    speed: Annotated[
+        float, Option(help="Speed of the simulation as a multiple of real time, 0.05 to 100.")
+    ] = 1.0
+    seed: Annotated[
+        int, Option(help="Seed of the scenery, the details of the light and the traffic.", min=0)
+    ] = 0
     tracks_dir: TracksDir = None
 
 
@@ -41,8 +56,8 @@ class WatchConfig:
 def watch(config: WatchConfig) -> None:
     """Watch a live drive in the browser, and drive the car with the arrow keys.
 
-    Shows several camera views, the plan of the track and the sensors. The first line on stderr is
-    the address; this machine needs no display. Ctrl-C ends it.
+    The page shows several camera views, the plan of the track and the sensors. Its address is the
+    first line on stderr. This machine needs no display. Ctrl-C ends the command.
     """
     from runtime.sockets import bind
     from simulator.camera import check_light

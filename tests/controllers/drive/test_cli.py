@@ -81,7 +81,7 @@ def test_the_help_of_drive_names_every_light_and_every_default() -> None:
     shown = " ".join(run("drive", "--help").stdout.replace("│", " ").split())
     assert all(kind in shown for kind in KINDS)
     # Rich drops text in square brackets, which these sentences must not have.
-    assert "Default: the paper's number on its tracks, about a lap on other tracks." in shown
+    assert "as in the paper; about a lap on other tracks." in shown
     assert "Default: 0.2. Not with --speed" in shown
 
 
