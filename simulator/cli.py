@@ -15,7 +15,7 @@ import typer
 
 from runtime import cli as command
 from simulator.link.command import link
-from simulator.track.cli import Lanes, TrackName, TracksDir, Traffic, tracks
+from simulator.track.cli import Lanes, TrackName, TracksDir, tracks
 from simulator.watch.cli import watch
 
 app = typer.Typer(
@@ -34,7 +34,8 @@ def centreline(
     track: TrackName,
     out: Annotated[Path, typer.Option(help="CSV file to write.")],
     step: Annotated[
-        float, typer.Option(help="Distance between two rows along the centre line, m.")
+        float,
+        typer.Option(help="Distance between two rows along the centre line, m, 0.01 to 1000."),
     ] = 1.0,
     tracks_dir: TracksDir = None,
 ) -> None:
@@ -65,9 +66,9 @@ def snapshot(
     roads: Annotated[
         str,
         typer.Option(
-            help="Kind of the road. paper: lanes of 4.0 m and the track's own lane markings; "
-            "varied: width of the lanes, shoulders, lane markings and surface are random, "
-            "determined by --seed."
+            help="Kind of the road. paper: lanes of --lane-width and the track's own lane "
+            "markings; varied: width of the lanes, shoulders, lane markings and surface "
+            "are random, determined by --seed."
         ),
     ] = "paper",
     seed: Annotated[
@@ -98,8 +99,8 @@ def snapshot(
     kind: Annotated[
         str,
         typer.Option(
-            help="Kind of the images: colour, depth (distances as colours) or class (kinds of objects "
-            "as colours)."
+            help="Kind of the images: colour, depth (colours show distances) or class (colours "
+            "show kinds of objects)."
         ),
     ] = "colour",
     camera: Annotated[

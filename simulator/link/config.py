@@ -22,8 +22,8 @@ class LinkConfig:
     name: Annotated[
         str,
         Option(
-            help="Name of the shared memory through which the client and the simulator exchange data. "
-            "It begins with a slash."
+            help="Name of the shared memory, with a slash at its start. The client opens the "
+            "memory by this name."
         ),
     ] = DEFAULT_NAME
     lanes: Lanes = 1
@@ -45,8 +45,8 @@ class LinkConfig:
     light: Annotated[
         str,
         Option(
-            help="Light and weather in the images: clear, overcast, dusk, fog, heavy-shadow, rain or "
-            "snow."
+            help="Light and weather in the images: clear, overcast, dusk, fog, heavy-shadow, "
+            "rain, snow."
         ),
     ] = "clear"
     tracks_dir: TracksDir = None

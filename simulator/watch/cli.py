@@ -35,10 +35,7 @@ class WatchConfig:
     ] = "clear"
     host: Annotated[
         str,
-        Option(
-            help="Address on which the page is served. With the default, only this machine can reach "
-            "it."
-        ),
+        Option(help="Address of the page. With the default, only this machine can reach the page."),
     ] = "127.0.0.1"
     port: Annotated[int, Option(help="Port of the page; 0: any free port.", min=0, max=65535)] = (
         8765
