@@ -61,9 +61,9 @@ class Service:
         """`check` warms up the engine and raises an error if its outputs are wrong. It runs when
         the application starts (ASGI lifespan); until it returns, /readyz and /features answer 503.
 
-        `shared` is the workers' shared memory and `block` this worker's block in it; None for a
-        single worker. `cameras` are the cameras that requests can name. Without `tracer` no traces
-        are recorded.
+        `shared` is the workers' shared memory (None for a single worker), and `block` the number of
+        this worker's block in it. `cameras` are the cameras that requests can name. Without
+        `tracer` no traces are recorded.
         """
         self.limits = limits or Limits()
         self.shared = shared or create_shared_memory(1)

@@ -2,9 +2,9 @@
 
     serve ray --model runs/latest --replicas 2 --port 8000
 
-runs it on the cluster at $RAY_ADDRESS, or on a new local cluster, until Ctrl-C. `build` is the
-application builder for Ray's own `run`, `deploy` and configuration files
-(`import_path: serve.on_ray:build`, `args: {model: /runs/latest}`).
+This command runs the service on the cluster at $RAY_ADDRESS, or on a new local cluster, until
+Ctrl-C. `build` is the application builder for Ray's own commands `serve run` and `serve deploy` and
+for its configuration files (`import_path: serve.on_ray:build`, `args: {model: /runs/latest}`).
 
 Ray handles restarts, scaling and the port. So streams and rate limits apply to each replica
 separately, and Ray's proxies set the limits for slow clients.

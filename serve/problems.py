@@ -172,7 +172,7 @@ def small_chunks(size: int) -> Problem:
 
 def too_many_requests(what: str) -> Problem:
     """Make the problem for requests sent without waiting for earlier replies; `what` is the
-    limit."""
+    exceeded limit, such as "16 requests"."""
     return Problem(RATE_LIMITED, f"more than {what} arrived at once; wait for the replies")
 
 

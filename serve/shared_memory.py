@@ -25,7 +25,7 @@ COMMITTED_GENERATION = 0  # head: the generation of weights that all workers use
 WORKER_WORDS = 256
 HEARTBEAT, CONNECTIONS, WAITING, READY = 0, 1, 2, 3  # monotonic s; counts; 1.0 or 0.0
 BODY_BYTES = 4  # bytes of bodies in flight
-ROOM_ASKED, ROOM_FOR = 5, 6  # count of requests for room; `least` of the latest request
+ROOM_ASKED, ROOM_FOR = 5, 6  # number of calls of `ask_for_room`; `least` of the latest call
 MAX_OUTCOMES = 64
 STAGES, STAGE_WORDS = 4, 16
 FRAME_COUNTS = 8  # MAX_OUTCOMES counters: frames by outcome
@@ -133,8 +133,8 @@ class WorkerPeers:
 
     def room_asked(self) -> int | None:
         """Return the smallest `least` that other workers have passed to `ask_for_room` since the
-        last call here; None if there was no request, or if another worker has more connections and
-        must act."""
+        last call of `room_asked`. Returns None if none has called it, or if another worker has more
+        connections and must end one."""
         before, self._room_asked = self._room_asked, [cells[ROOM_ASKED] for cells in self._others]
         if self._own[CONNECTIONS] < max(self.other_connections(), default=0):
             return None

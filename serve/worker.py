@@ -1,9 +1,11 @@
 """One worker process: one engine, one event loop. `serve.workers.supervisor` starts it as
-`python -m serve.worker FD`; the two exchange lines of JSON over the socket FD.
+`python -m serve.worker FD`; supervisor and worker exchange lines of JSON over the socket FD.
 
-The supervisor sends the WorkerTask, then {"load": folder, "generation": n} and {"drop": n}. The
+The supervisor sends the WorkerTask first. For a reload it sends {"load": folder, "generation": n};
+if the reload fails in any worker, it sends {"drop": n}, and the new weights are discarded. The
 worker sends {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
-...}, and {"ready": true}. When the supervisor closes the socket, the worker stops.
+...} for each generation n of weights, and {"ready": true} once it can answer images. When the
+supervisor closes the socket, the worker stops.
 """
 
 import gc
@@ -91,8 +93,9 @@ def main() -> None:
 
 
 def load(folder: Path, expected: str | None, *, views: int) -> Engine:
-    """Load the engine of the run in `folder`. Raises UserError if that fails, or if its weights do
-    not have the hash `expected`."""
+    """Load the engine of the model in `folder`. `expected`: the required hash of the weights; None
+    accepts any. `views`: number of views of each image whose answers are averaged. Raises UserError
+    if the model cannot be loaded or its weights have another hash."""
     engine = load_engine(folder, views=views)
     found = engine.card.model_hash
     if expected is not None and found != expected:

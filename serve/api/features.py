@@ -246,7 +246,7 @@ class FeaturesRequest:
         frames = self._frames
         if frames.tracer is not None:
             self._span = frames.tracer.begin("/features", headers.items(), self._client)
-        # An overloaded worker must not read bodies. A frame of a stream can replace a queued one.
+        # An overloaded worker reads no bodies, except for frames that can replace a queued frame.
         full = None if b"x-stream-id" in headers else frames.queue.refusal(self._client)
         if full is not None:
             self._send_problem(full)

@@ -20,8 +20,8 @@ from serve.api.request_options import OPTIONS, check_names, parse_json_object
 from serve.problems import INVALID_REQUEST, Problem
 
 MAX_DEPTH = 4
-MAX_VALUES = 1_300_000  # JSON values and lists: 640 x 480 px; each blocks the event loop for 10 ns
-MAX_SMALL_BYTES = 4096  # JSON size of shape, outputs and parameters
+MAX_VALUES = 1_300_000  # JSON values and lists, enough for 640 x 480 px; decoding one takes 10 ns
+MAX_SMALL_BYTES = 4096  # largest JSON size of a shape, of the outputs or of an object of parameters
 WINDOW_BYTES = 1 << 16  # JSON or base64 decoded in one piece; other tasks can run in between
 SIZE, BINARY, ALL_BINARY = "binary_data_size", "binary_data", "binary_data_output"
 # Known parameters of an input, of an output and of a request; OPTIONS are the options of an image.
@@ -104,7 +104,8 @@ class _RawRequest(_Misplaced):
 
 
 def read_json_length(body: bytes, header: bytes | None) -> int:
-    """Return the size in bytes of the JSON part: `header`, or all of `body`. Raises Problem."""
+    """Size in bytes of the JSON part: `header` (Inference-Header-Content-Length), else the whole
+    body. Raises Problem."""
     if header is None:
         return len(body)
     usable = header.isdigit() and len(header) <= MAX_LENGTH_DIGITS
@@ -114,8 +115,7 @@ def read_json_length(body: bytes, header: bytes | None) -> int:
 
 
 def parse_request(body: bytes, length: int) -> tuple[InferRequest, memoryview]:
-    """Decode the JSON part of a request, the first `length` bytes of `body`; return it and the
-    remaining, binary part. Raises Problem."""
+    """Decode the JSON part, the first `length` bytes of `body`; return it and the binary rest."""
     text, values = np.frombuffer(body, np.uint8, length), 0
     for start in range(0, length, COUNT_BYTES):
         part = text[start : start + COUNT_BYTES]

@@ -43,7 +43,8 @@ from serve.scheduling.rate_limit import RateLimiter
 
 PATH = "/stream"
 PROTOCOLS = {"driverview.json": JSON, "driverview.msgpack": MSGPACK}
-# Pauses after a refused message, so that a client with many of them does not delay other clients.
+# Pauses (s) after a refused message, so that a client with many refused messages does not delay
+# other clients. The second pause follows a refusal with status 503.
 REFUSAL_PAUSE_S, BUSY_PAUSE_S = 0.01, 0.002
 MAX_TEXT = 1024  # largest number of characters of a text message
 FRAME_OPTIONS = {name: OPTIONS[name] for name in ("frame_id", "deadline_ms", "fov_y", "camera")}
@@ -54,7 +55,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class StreamOptions:
-    """The options in the handshake of a WebSocket; `deadline_ms` is the text that was sent."""
+    """The options in the handshake of a WebSocket, which are the `defaults` of its frames.
+
+    `protocol`: the accepted subprotocol, if there is one; `deadline_ms`: the text that was sent;
+    `client`: address of the client.
+    """
 
     defaults: RequestOptions
     protocol: str | None
@@ -90,7 +95,8 @@ class Stream:
         number, metadata = 0, ""
         while (message := await receive())["type"] == "websocket.receive":
             if message.get("bytes") is None:
-                metadata = message["text"][: MAX_TEXT + 1]  # no megabytes for an idle client
+                # Cut, so that an idle client keeps no megabytes in memory.
+                metadata = message["text"][: MAX_TEXT + 1]
                 message.clear()
                 continue
             number += 1
@@ -119,7 +125,11 @@ class Stream:
         send: Send,
     ) -> None:
         """Answer the image in `message`, and empty `message` before the answer is sent: a slow
-        client must not keep its image in memory."""
+        client must not keep its image in memory.
+
+        `stamp_ns`: time of arrival, ns of the monotonic clock. `number`: number of the image in its
+        WebSocket, from 1. `metadata`: text message with options of the image, or empty.
+        """
         request_id = f"{stream.defaults.request_id}/{number}"
         frame_id = stream.defaults.frame_id or number
         share = self._frames.share()

@@ -1,5 +1,5 @@
 """Records OpenTelemetry spans: the span of a request for features contains the span of its frame,
-and that contains the spans of the frame's stages.
+which contains the spans of the frame's stages (waiting, decoding, forward pass).
 
 A request continues the trace of its `traceparent` header (W3C Trace Context); a frame of a
 WebSocket continues the trace of the handshake. Probes, pages, requests refused before they are read

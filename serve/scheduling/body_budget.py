@@ -1,9 +1,10 @@
 """Limits for request bodies: the size of one body, and the memory of all bodies of all workers.
 
-Each worker writes its number of bytes into its block of the shared memory. There is no lock, so
-simultaneous requests in different workers can each exceed the budget by a body. If the budget is
-exhausted, requests whose bodies arrive slowly are ended in favour of small bodies. Otherwise a few
-clients that withhold the last bytes of large bodies could block all other clients.
+Each worker writes the number of bytes of its bodies into its block of the shared memory. There is
+no lock, so simultaneous requests in different workers can each exceed the budget by one body. If
+the budget is exhausted, requests whose bodies arrive slowly are ended in favour of bodies of up to
+256 KiB (SMALL_BYTES). Otherwise a few clients that withhold the last bytes of large bodies could
+block all other clients.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ class BodyBudget:
         """`block` is this worker's block of `shared`; `limit` in bytes is for all workers."""
         blocks = [shared.worker(number) for number in range(shared.blocks)]
         self._own = blocks[block]
-        self._own[BODY_BYTES] = 0.0  # overwrites the count of an earlier worker
+        self._own[BODY_BYTES] = 0.0  # overwrites the count of the worker that had this block before
         self._others = [cells for number, cells in enumerate(blocks) if number != block]
         self._limit = limit
         self.held = 0
@@ -33,7 +34,8 @@ class BodyBudget:
     def take(self, size: int, small: bool) -> None:
         """Reserve `size` more bytes. Raises Problem if they exceed the budget.
 
-        With `small`, requests whose bodies arrive slowly are ended to make room.
+        `small`: whether the whole body has at most 256 KiB (SMALL_BYTES) so far; if it is true,
+        requests whose bodies arrive slowly are ended to make room.
         """
         excess = self._excess(size)
         if excess > 0 and not (small and self.end_slow_bodies(excess) >= excess):

@@ -10,15 +10,18 @@ from mtlnet.inference.prediction import Prediction
 from trackfeatures.camera import CameraParameters
 
 PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
-"""Returns the pixels (height, width, 3) uint8 RGB in the view of the model's camera."""
+"""Called with the model's camera; returns the image's pixels (height, width, 3), uint8 RGB, in the
+view of that camera."""
 ResultCallback = Callable[["FrameResult | Exception"], None]
 """Called once with the result of a frame, or with the error that ended it."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """The prediction for a frame, the members that identify model and engine, and the times in ms
-    of waiting, decoding and the forward pass."""
+    """The prediction for a frame, and the times in ms of waiting, decoding and the forward pass.
+
+    `provenance`: the members of the answer that identify the model and the engine.
+    """
 
     prediction: Prediction
     provenance: dict[str, str]
@@ -29,11 +32,13 @@ class FrameResult:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image to process. `stamp_ns` and `deadline_ns` are in ns of the monotonic clock.
+    """An image to process. `read` returns its pixels.
 
-    `stream` is 0 for a frame without a stream. `cost_ms` is the estimated decoding time in ms; for
-    a `small` image it is shorter than the forward pass of the network. `source` is the image's
-    camera if its pixels are warped into the view of the model's camera.
+    `stamp_ns`: time at which the request began; `deadline_ns`: time until which the processing must
+    begin; both in ns of the monotonic clock. `stream`: key of the stream, 0 for a frame without a
+    stream. `client`: address of the client. `cost_ms`: estimated decoding time in ms; for a `small`
+    image it is shorter than the forward pass of the network. `source`: the image's camera if `read`
+    warps the pixels into the view of the model's camera, else None.
     """
 
     read: PixelReader

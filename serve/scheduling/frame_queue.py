@@ -6,10 +6,11 @@ queued frame of that stream. A frame whose deadline has passed is dropped before
 Clients take turns (`serve.scheduling.fair_queue`).
 
 A small frame that arrives alone is processed on the event loop itself if the engine is fast: the
-switch to another thread and back costs more than all other work besides the model. Frames that
-arrive in the meantime would have to wait for this frame anyway. Two or more waiting frames go to
-the thread, unless the worker has no second core: on one core the thread and the loop would only
-interrupt each other. Between two frames the loop handles all requests that have arrived.
+switch to another thread and back takes longer than all other work for the frame except the forward
+pass. Frames that arrive in the meantime would have to wait for this frame anyway. Two or more
+waiting frames go to the thread, unless the worker has no second core: on one core the thread and
+the loop would only interrupt each other. Between two frames the loop handles all requests that have
+arrived.
 """
 
 import asyncio
@@ -34,7 +35,8 @@ from serve.scheduling.streams import StreamTable
 
 SMOOTHING = 0.1  # weight of the latest frame in the running mean of the time per frame
 INLINE_MAX_MS = 10.0  # longest time per frame at which frames are processed on the event loop
-LARGE_MS = 30.0  # a longer decoding time needs an admission; 30 ms is the time of a JPEG of 3 Mpx
+# Images with a longer decoding time pass `Admission` first; 30 ms is the time of a JPEG of 3 Mpx.
+LARGE_MS = 30.0
 INLINE_AFTER = 8  # consecutive frames within INLINE_MAX_MS before the event loop runs the engine
 
 logger = logging.getLogger(__name__)
@@ -56,8 +58,9 @@ class FrameQueue:
         single_core: bool = False,
     ) -> None:
         """At most `capacity` frames wait while a frame is processed. `warm_up` runs and checks the
-        engine before the first frame. With `single_core` (the worker has no second core) the event
-        loop itself processes small frames even if several wait.
+        engine before the first frame. `streams` records the newest frame of each stream. With
+        `single_core` (the worker has no second core) the event loop itself processes small frames
+        even if several wait.
         """
         self._current = LoadedEngine.of(engine)
         self._staged: StagedEngine | None = None
@@ -148,7 +151,8 @@ class FrameQueue:
     def refusal(self, client: str) -> Problem | None:
         """Return the problem if the queue has no room for a client's frame, else None.
 
-        Many frames share this object, so code that raises it must drop its traceback afterwards.
+        Many frames share the returned object, so code that raises it must drop its traceback
+        afterwards.
         """
         if not self.full:
             return None
@@ -175,7 +179,10 @@ class FrameQueue:
 
     def _enqueue_large(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
         """Admit a large image and queue its frame; the admission ends with the frame's result.
-        Returns the function that refuses a replaced frame, if there is one. Raises Problem."""
+
+        Returns the function that refuses the frame that this frame replaces; None if it replaces
+        none. Raises Problem if the image is not admitted or the queue has no room.
+        """
         done = self._admission.admit(frame.client, frame.cost_ms, frame.stamp_ns)
 
         def finish(result: FrameResult | Exception) -> None:
@@ -189,10 +196,8 @@ class FrameQueue:
             raise
 
     def _enqueue(self, frame: Frame, on_result: ResultCallback) -> Callable[[], None] | None:
-        """Queue a frame. Returns the function that refuses the frame it replaces, if there is one.
-
-        Raises Problem if the queue has no room.
-        """
+        """Queue a frame. Returns the function that refuses the frame that this frame replaces; None
+        if it replaces none. Raises Problem if the queue has no room."""
         with self._queue_lock:
             superseded = self._supersede(frame, on_result) if frame.stream else None
             if superseded is not None:
@@ -207,14 +212,14 @@ class FrameQueue:
             self._waiting.append(slot)
             if not self._dispatched:
                 self._dispatched = True
-                # Later, so that the loop first reads all requests that have arrived.
+                # Called later, so that the loop first reads all requests that have arrived.
                 self._loop.call_soon(self._dispatch)
             return None if last is None else partial(last.on_result, queue_full(*self._load()))
 
     def _supersede(self, frame: Frame, on_result: ResultCallback) -> ResultCallback | None:
-        """Put a frame into its stream's slot, unless a newer frame is in it.
+        """Put a frame into its stream's slot, unless a newer frame is in this slot.
 
-        Returns the callback of the superseded frame, None if the stream has no slot.
+        Returns the callback of the older of the two frames; None if the stream has no slot.
         """
         slot = self._waiting.of_stream(frame.stream)
         if slot is None:

@@ -73,8 +73,8 @@ class Admission:
         while len(self._credit) >= MAX_CLIENTS:
             self._credit.pop(next(iter(self._credit)))
         self._credit.pop(client, None)
-        # A client with negative credit was alone until now: its images delayed no other client.
-        # Its debt is dropped: the debt of a client is at most the cost of one image.
+        # A client with negative credit is alone here: its images delayed no other client. So its
+        # debt is dropped, and a client's debt is never larger than the cost of one image.
         self._credit[client] = (max(credit, 0.0) - cost_ms, now_ns)
         self._client_ms[client] = own + cost_ms
         self._pending_ms += cost_ms

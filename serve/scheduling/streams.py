@@ -10,7 +10,8 @@ from hashlib import blake2b
 
 from serve.shared_memory import PROBES, STREAM_ENTRIES, STREAM_WORDS
 
-EXPIRY_NS = 10_000_000_000  # age at which another stream can use the entry; all frames wait less
+# Age of an entry from which another stream can use it; no frame waits that long.
+EXPIRY_NS = 10_000_000_000
 
 
 @lru_cache(4096)

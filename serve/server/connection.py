@@ -110,7 +110,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self.cycle.transport = LingeringTransport(self)  # type: ignore[assignment]
 
     def end(self) -> None:
-        """Close after the last reply; if the client can still be sending, wait until it closes."""
+        """Close after the last reply; if the client can still be sending, read until it closes."""
         lingers = self.guard.draining or self._phase is Phase.BODY
         (self.linger if lingers else self.transport.close)()
 
@@ -240,7 +240,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        # The time of an idle connection; a refused connection already has an earlier deadline.
+        # The client has `idle_s` to read the reply; a refused connection has an earlier deadline.
         self._deadline_s = min(self._deadline_s, self.guard.clock() + self.guard.limits.idle_s)
 
     def resume_writing(self) -> None:
@@ -304,7 +304,7 @@ class GuardedProtocol(HttpToolsProtocol):
         (self.transport.close if idle else self.transport.abort)()
 
     def end_slow_body(self, now: float) -> int:
-        """End a body that has been arriving for 0.1 s (EVICTABLE_S); return the bytes it held."""
+        """Close if a body has been arriving for 0.1 s (EVICTABLE_S); return its freed bytes."""
         if self._phase is not Phase.BODY or now - self.since_s < guards.EVICTABLE_S:
             return 0
         held = 0 if self.cycle is None or self.cycle.response_complete else self._unread_bytes
@@ -328,8 +328,8 @@ class GuardedProtocol(HttpToolsProtocol):
             (self.transport.close if idle else self.transport.abort)()
 
     def close_with(self, problem: Problem) -> None:
-        """Send a problem and close. If an earlier request still waits for its reply, send that
-        reply instead."""
+        """Send a problem and close the connection. If an earlier request still waits for its reply,
+        this reply is sent instead of the problem."""
         owed = self._running if self.pipeline or self._phase is Phase.WORK else None
         self._phase = Phase.CLOSING
         now = self.guard.place(self, self.guard.refused)

@@ -71,8 +71,8 @@ class DirectRequest:
             self.parts.append(bytearray(part))
 
     def drop(self) -> None:
-        """Drop the body and `features`. This object and `features` reference each other; without
-        this, both would stay in memory until the next garbage collection."""
+        """Drop the body and `features`. This object and `features` reference each other; without a
+        call of `drop`, both would stay in memory until the next garbage collection."""
         if self.features is not None:
             self.features.abandon()
         self.features = None
@@ -188,7 +188,7 @@ class DirectProtocol(GuardedProtocol):
         if reply.status == OK:
             self._idle_group = self.guard.served
         self.on_response_complete()
-        if self.flow.write_paused:  # no more requests from a client that reads no replies
+        if self.flow.write_paused:  # read no more requests of a client that reads no replies
             self.flow.pause_reading()
         elif reply.status == UNAVAILABLE and self._service.frame_queue.is_thread_behind:
             self.guard.pause_reading(self)

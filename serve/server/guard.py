@@ -82,6 +82,7 @@ class ConnectionGuard:
     ask_for_room: Callable[[int], None] = lambda _least: None
     """Asks another worker to end a connection of a client with at least this many connections."""
     count_closed: Callable[[ProblemType], None] = lambda _type: None
+    """Counts a connection that was closed for this reason."""
     bodies: BodyBudget | None = None
     """The budget for incomplete WebSocket messages; None: no budget."""
     reading: Guarded | None = None
@@ -146,10 +147,11 @@ class ConnectionGuard:
         """End `excess` connections: refused, slow, idle, then WebSockets, the oldest first. Returns
         False if fewer could be ended.
 
-        Refused connections of any client are ended, others only if their client has at least
-        `least` connections, the number of the new connection's client. A request counts as slow
-        after 0.1 s (EVICTABLE_S), a WebSocket as idle after `idle_s` without a message. If too few
-        are that old, younger ones are ended of clients with more than `least` connections.
+        Refused connections of any client are ended; all other connections are ended only if their
+        client has at least `least` connections. `least` is the number of connections of the new
+        connection's client. A request counts as slow after 0.1 s (EVICTABLE_S), a WebSocket as idle
+        after `idle_s` without a message. If too few requests and WebSockets have reached these
+        ages, younger ones are ended too, but only of clients with more than `least` connections.
         """
         for group, age_s, count in (
             (self.refused, 0.0, 0),

@@ -13,12 +13,12 @@ class LingeringConnection(Protocol):
     transport: asyncio.Transport
 
     def end(self) -> None:
-        """Close after the last reply; if the client can still be sending, wait until it closes."""
+        """Close after the last reply; if the client can still be sending, read until it closes."""
 
 
 class LingeringTransport:
     """Replaces the transport of a connection for its last reply: `close` calls the connection's
-    `end`, which reads on before it closes."""
+    `end`, which can read on before it closes the connection."""
 
     def __init__(self, connection: LingeringConnection) -> None:
         self._connection = connection

@@ -1,5 +1,5 @@
-"""Handles requests with an upgrade: opens a WebSocket for its handshake and ignores any other
-upgrade, as RFC 9110 (7.8) allows."""
+"""Handles requests with an Upgrade header. If the request is the handshake of a WebSocket, a
+WebSocket is opened. Any other upgrade is ignored, as RFC 9110 (7.8) allows."""
 
 from typing import TYPE_CHECKING
 
@@ -27,8 +27,9 @@ def parse_upgrades(connection: "GuardedProtocol", rest: bytes) -> None:
 
 
 def _upgrade(connection: "GuardedProtocol", rest: bytes) -> bytes:
-    """Open a WebSocket for a handshake or refuse it, and return b"". For another upgrade, return
-    the request without the upgrade headers, followed by `rest`, to be parsed again."""
+    """Answer the handshake of a WebSocket (open the WebSocket, or refuse it) and return b"". For
+    any other upgrade, return the request without its upgrade headers, followed by `rest`; the
+    caller parses these bytes again."""
     connection.upgrading = False
     if connection.parser.get_method() == b"CONNECT":
         connection.send_400_response("")

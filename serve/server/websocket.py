@@ -32,7 +32,7 @@ from serve.scheduling.body_budget import BodyShare
 from serve.server import guard as guards
 from serve.server.guard import ConnectionGuard, Group
 
-SLICE_BYTES = 4096  # bytes parsed between two counts of small frames; hundreds of them fit
+SLICE_BYTES = 4096  # bytes parsed between two counts of small frames; hundreds of frames fit in
 SMALL_BYTES = 2048  # a frame with fewer bytes is small
 SMALL_FRAMES = 500  # small frames and texts per second, and in one burst
 MAX_TEXT_BYTES = 4096  # size of a text message: at least 1,024 characters in UTF-8
@@ -254,8 +254,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.fail(CloseCode.TRY_AGAIN_LATER, "closed for another client: no message for long")
 
     def end_slow_body(self, now: float) -> int:
-        """Close if a message has been arriving for 0.1 s (EVICTABLE_S) at `now` (in s); returns the
-        number of bytes it held."""
+        """Close the connection if a message has been arriving for 0.1 s (EVICTABLE_S) at `now` (in
+        s). Returns the number of freed bytes: those that this connection held in the budget."""
         held = 0 if self._share is None else self._share.size
         since_s = self._message_end_s - self._guard.limits.body_s
         if not held or self._discarding or now - since_s < guards.EVICTABLE_S:

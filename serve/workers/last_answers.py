@@ -1,8 +1,9 @@
-"""Answers connections that arrive while the service stops: each request gets 503, then a close.
+"""Answers connections that arrive while the service stops: the first request of each connection
+gets status 503, then the connection is closed.
 
-In the meantime the workers finish the requests of their own connections. Closing the listening
-socket would reset connections that were not accepted, and closing a connection with unread bytes
-resets it: the client would not learn the reason.
+In the meantime the workers finish the requests of their own connections. If the listening socket
+were closed at once, connections that were not accepted yet would be reset. A connection that is
+closed with unread bytes is reset too. In both cases the client would not learn the reason.
 """
 
 import asyncio

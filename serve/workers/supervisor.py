@@ -38,8 +38,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ServicePlan:
-    """The model, the number of workers and the limits of a service. `resolve` maps a model's name
-    to its folder."""
+    """The model, the number of workers and the limits of a service.
+
+    `resolve` maps a model's name to its folder. `cameras`: the cameras that clients can name, by
+    name. `views`: number of views of each image whose answers are averaged.
+    """
 
     model: str
     resolve: Callable[[str], Path]
@@ -84,7 +87,9 @@ class Supervisor:
         # Until all workers have started, there is nothing to reload or to replace.
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup, lambda: None)
         loop.add_signal_handler(signal.SIGUSR2, lambda: None)
-        for listener in self._listeners:  # after the handlers: a signal would reset connections
+        # Listen after the handlers are set: without them, a signal would end the process and reset
+        # connections that have not been accepted.
+        for listener in self._listeners:
             listener.listen(BACKLOG)
         for position in range(self._plan.workers):
             self._workers[position] = await self._start_worker(self._free_block())
@@ -199,7 +204,7 @@ class Supervisor:
         while True:
             worker = self._workers[position]
             await worker.wait_exit()
-            # A killed worker cannot do this: its bodies would remain in the shared budget.
+            # A killed worker cannot clear its status: its bodies would still count in the budget.
             WorkerPeers(self._shared, worker.task.block).withdraw()
             if self._workers[position] is not worker:
                 backoff_s = MIN_BACKOFF_S

@@ -22,11 +22,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """The configuration of a new worker, sent as its first message.
+    """The configuration of a new worker, which the supervisor sends as its first message.
 
-    `expected` is the required hash of the weights; None accepts any. `listeners` and `memory` are
-    inherited file descriptors. `block` is the worker's block of the shared memory, which has
-    `blocks` blocks.
+    `folder`: folder of the model; `generation`: number of its weights, see `serve.worker`;
+    `expected`: required hash of the weights, None accepts any. `listeners` and `memory`: inherited
+    file descriptors of the listening sockets and of the shared memory. `block`: number of the
+    worker's block of the shared memory, which has `blocks` blocks. `cameras`: the cameras that
+    clients can name, by name. `views`: number of views of each image whose answers are averaged.
     """
 
     folder: str
@@ -112,8 +114,8 @@ class WorkerProcess:
         return message
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until the worker can answer images. Raises UserError if it ends before or needs more
-        than `timeout_s`."""
+        """Wait until the worker can answer images. Raises UserError if the worker ends before that,
+        or is not ready after `timeout_s` (s)."""
         waits = [asyncio.ensure_future(w) for w in (self._ready.wait(), self.wait_exit())]
         await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
         for wait in waits:
@@ -128,7 +130,7 @@ class WorkerProcess:
         await self._process.wait()
 
     async def stop(self, timeout_s: float) -> None:
-        """Send SIGTERM, and SIGKILL if the process has not ended after `timeout_s`."""
+        """Send SIGTERM, and SIGKILL if the process has not ended after `timeout_s` (s)."""
         if self._process.returncode is None:
             self._process.terminate()
             try:
