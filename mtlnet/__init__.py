@@ -9,17 +9,20 @@ from typing import TYPE_CHECKING, Any, cast
 if TYPE_CHECKING:
     from mtlnet.api import Features, Model, load
 
-# OpenVINO and NNCF send usage statistics to their makers with this package, from a fork of the
-# process that converts a model. Without it, which both allow, they send nothing.
+# OpenVINO and NNCF use the package openvino_telemetry to send usage statistics to their makers,
+# from a fork of the process that converts a model. Both also work without this package, and then
+# send nothing.
 sys.modules.setdefault("openvino_telemetry", cast(Any, None))
 
 __all__ = ["Features", "Model", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import `Features`, `Model` or `load` from `mtlnet.api` at its first use and return it.
+    """Import the object called `name` (`Features`, `Model` or `load`) from `mtlnet.api` and return
+    it. Python calls this function when the object is used.
 
-    So `import mtlnet` alone loads neither numpy nor torch. Raises AttributeError for another name.
+    So `import mtlnet` alone loads neither numpy nor torch. Raises AttributeError for any other
+    name.
     """
     if name not in __all__:
         raise AttributeError(f"module 'mtlnet' has no attribute {name!r}")

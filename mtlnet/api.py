@@ -61,10 +61,10 @@ class Features(Prediction):
     def draw(self, image: OneImage | None = None) -> Image:
         """Draw the features; returns a picture (H, W, 3), uint8 RGB.
 
-        `image`: the image that was given to `predict`, at any size of its aspect ratio; the
-        markings are drawn on a copy of it, as straight lines on a flat road. None: the result is
-        the image in the model's view, with the markings, a view from above and the features as
-        text.
+        `image`: the image that was given to `predict`, in any size with the same aspect ratio; the
+        markings are drawn on a copy of this image, as straight lines on a flat road. None: the
+        result is the image in the model's view, with the markings, a view from above and the
+        features as text.
         """
         if image is None:
             return draw_prediction(self.source, self, self.model_camera)
@@ -140,10 +140,11 @@ class Model:
         list of images it is a list of `Features`. For a film, folder, pattern, recorded round, ROS
         2 bag, webcam number or address of a stream (all as text, as for `mtlnet predict`) it is an
         iterator, which reads and predicts image by image. `camera`: a camera file or
-        CameraParameters of the images; "model": the model's camera took them; None: the same,
-        except that the mount of a film's camera is estimated from the film. `fov_y_deg`: vertical
-        field of view of the images, if no `camera` is given. `topic`: topic with the pictures of a
-        recording.
+        CameraParameters of the images; "model": the model's camera took them; None: as with
+        "model", except that the camera of a film or stream is estimated from its pictures. With
+        "model" and None, the camera that a recording states has precedence. `fov_y_deg`: vertical
+        field of view of the images in degrees, if no `camera` is given. `topic`: topic with the
+        pictures of a recording.
 
         Raises UserError for a source that cannot be used (ImageError for one image). An iterator
         raises UserError after the last image, if any image could not be used. Messages about the
@@ -259,11 +260,12 @@ def load(
 
     `model`: a shipped model ("default", or "varied" for real roads and lanes of 2.8 to 4.3 m), the
     name of a run in `runs/`, or the folder of a run. `engine`: "openvino" or "torch". `precision`:
-    "int8", "bf16" or "f32"; None: int8 if the model has an int8 graph that passed its accuracy
-    gate, else bf16 if the processor supports it, else f32. `threads`: number of CPU threads that
-    compute one image. `views`: 1, 2 (and the mirrored image) or 6 (and both turned left and right)
-    views of each image, whose answers are averaged; the time is proportional to it. Raises
-    ModelError when the model is missing or damaged.
+    "int8", "bf16" or "f32"; None: int8 if the model has an int8 graph whose additional errors are
+    within the limits that `mtlnet export` checks, else bf16 if the processor supports bf16, else
+    f32. `threads`: number of CPU threads that compute one image. `views`: number of views of each
+    image whose answers are averaged: 1, the image alone; 2, also its mirror image; 6, also both of
+    these turned to the left and to the right. The time is proportional to the number of views.
+    Raises ModelError when the model is missing or damaged.
     """
     run = resolve_run(str(model))
     return Model(run, engine, precision, threads, views=views)

@@ -5,9 +5,10 @@
 `deepdriving`: the network of Chen et al. (DeepDriving, ICCV 2015), with which the paper compares
 its network. It is AlexNet with a fourth fully connected layer, trained on one task, the regression
 of coded values. Layers, padding and local response normalisation are taken from the authors' Caffe
-model. Deviations: it has our six coded values as outputs instead of their fourteen; its outputs are
-linear, without a sigmoid; no mean image is subtracted; it is trained with the recipes of `mtlnet
-train`. It has no classifier: each class has probability one third.
+model. Deviations from this model: the outputs are the six coded values of this project (five
+distances and the angle) instead of the authors' fourteen; the outputs are linear, without a
+sigmoid; no mean image is subtracted; the network is trained with the recipes of `mtlnet train`. It
+has no classifier: each class of the road has probability one third.
 
 `grid`: five convolutions that keep a grid of 9 x 18 positions; the paper's convolutions end in a
 single position. Its outputs are distributions over bins (`mtlnet.model.bins`). It does not read the
@@ -18,8 +19,8 @@ the grid and the curvature ahead from the shared features (`mtlnet.model.auxilia
 from a trained `grid` (`mtlnet.model.pretrained`).
 
 `mobilenet_v3_small`, `regnet_y_400mf`: for comparison, small modern backbones of torchvision with
-random initial weights. One layer of 256 units follows their pooled features; they have the same
-nine outputs as `mtl`.
+random initial weights. One layer of 256 units follows their pooled features. They have the same
+nine outputs as `mtl`: five coded distances, the coded angle and three class scores.
 """
 
 from dataclasses import dataclass, replace
@@ -33,8 +34,9 @@ HEIGHT, WIDTH = 210, 280
 class Conv:
     """A convolution and ReLU, the paper's Conv(n, k, s): n filters of k x k, stride s.
 
-    `pad`: number of zeros added at each side; None: SAME padding. `skip`: the input is added to the
-    output (a residual connection, He et al. 2015).
+    `pad`: number of zeros added at each side; None: SAME padding. `groups`: number of groups of
+    channels that are convolved separately. `skip`: the input is added to the output (a residual
+    connection, He et al. 2015).
     """
 
     filters: int
@@ -139,8 +141,9 @@ PAIR = slice(0, 2)
 ABSENT_ABOVE = (0.54, 0.54, 0.75, 0.54, 0.75)
 """Probabilities above which `ml`, `mr`, `l`, `m` and `r` are answered as absent, chosen on held-out
 frames (docs/experiments/uncertainty.md). A wrongly absent marking counts as an error of 4 to 5 m,
-and `l` and `r` are absent in 70 % of the frames. With 0.5 their mean error is larger by half; with
-0.9 a briefly trained model has a larger error of the offset from the lane's centre."""
+and `l` and `r` are absent in 70 % of the frames. With a limit of 0.5 the mean error of `l` and `r`
+is larger by half; with a limit of 0.9 a briefly trained model has a larger error of the offset from
+the lane's centre."""
 BIN_HEADS = (("distance", 5 * (DISTANCE_BINS + 1)), ("angle", ANGLE_BINS), ("heading", 3))
 ALEXNET: tuple[Layer, ...] = (
     Conv(96, 11, 4, pad=0),

@@ -118,11 +118,11 @@ def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
 
 
 def require_same_settings(config: AblationConfig, content_hash: str) -> None:
-    """Write the settings to the folder `config.out` if it is new or empty. If it already has
-    settings, raise UserError where they differ from `config` and `content_hash`; also if it holds
-    other files.
+    """Check that the folder `config.out` belongs to an ablation with the same settings. If the
+    folder is new or empty, write the settings to it.
 
-    `content_hash`: the hash of the dataset.
+    `content_hash`: the hash of the dataset, which is one of the settings. Raises UserError if the
+    folder has other settings, or has no settings but other files.
     """
     settings = {**config.shared_settings(), "content_hash": content_hash}
     path = config.out / SETTINGS
@@ -152,7 +152,8 @@ def finish_runs(
     """Train and evaluate the unfinished runs one after another, and yield each run once it is
     finished.
 
-    `train(config, resumed)` trains or resumes a run; `evaluate(folder, config)` returns the
+    `train(config, resumed)` trains a run; `resumed` is the stored description of the data of a
+    stopped run that continues, None for a new run. `evaluate(folder, config)` returns the
     evaluation of a trained run.
     """
     for run in runs:
@@ -206,8 +207,8 @@ def read_evaluation(folder: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table. `task`: index, in the task weights alpha, of the task that it
-    measures.
+    """A column of the table. `task`: index of the task that the column measures, in the task
+    weights alpha (distance, angle, class).
 
     `path`: the keys that lead to the value in an evaluation; `scale`: factor by which the HTML page
     multiplies the value.

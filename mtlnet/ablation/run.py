@@ -61,7 +61,7 @@ def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False
     """
     console = Console(stderr=True, markup=False)
     dataset = open_training_dataset(config.data)
-    dataset.select(config.split)  # raises where there are no such rounds
+    dataset.select(config.split)  # raises if the dataset has no rounds of this split
     runs = plan_runs(config, rows)
     if dry_run:
         return _plan_with_times(config, runs, dataset, console)
@@ -181,8 +181,8 @@ SINGLE_TASK_COLOUR = "#6a3fb5"  # the paper's purple line
 FINAL_SHARE = 0.05
 """The final loss of a run is the mean over this share of its steps, the last ones."""
 PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
-"""Columns after which the page shows the paper's figures, and their numbers of decimal places. The
-paper does not define its losses exactly."""
+"""The columns for which the page also shows the paper's figures, with the number of decimal places
+of these figures. The paper does not define its losses exactly."""
 
 
 def page(

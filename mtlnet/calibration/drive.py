@@ -30,8 +30,8 @@ Picture = NDArray[np.uint8]
 MakeLens = Callable[[tuple[int, int]], KnownLens]
 """A function that returns the lens of pictures of a size (width, height)."""
 Report = Callable[[float, float], None]
-"""A function that is called with the part done and the whole: s of a film, or numbers of pictures.
-"""
+"""A function that is called with what is done so far and the total, both in s of a film or in
+numbers of pictures."""
 
 
 @dataclass(frozen=True)

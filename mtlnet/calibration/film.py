@@ -121,8 +121,9 @@ class DriveCalibration:
         return len(self._samples)
 
     def add(self, picture: NDArray[np.uint8], time_s: float, *, bgr: bool = False) -> None:
-        """Add a picture (H, W, 3), RGB or BGR, with the aspect ratio of the lens, taken at `time_s`
-        (s). Times must increase. Most pictures are skipped, because they are too close in time."""
+        """Add a picture (H, W, 3), taken at `time_s` (s), of the lens's camera in any size with its
+        aspect ratio; `bgr`: the channels are BGR, not RGB. Times must increase. Most pictures of a
+        film are skipped: markings are found in a picture every 0.2 s (SAMPLE_S)."""
         if time_s >= self._next_s:
             self._next_s = max(self._next_s + SAMPLE_S, time_s + SAMPLE_S / 2)
             small = self._resized(picture, bgr)

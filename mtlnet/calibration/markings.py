@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_WIDTH = 0.3
-"""Maximum width of a bar in px over the number of rows below the horizon: paint 0.36 m wide for a
-camera 1.2 m above the road."""
+"""Maximum width of a bar in px, divided by the number of rows between the bar and the horizon. The
+limit is reached by paint 0.36 m wide for a camera 1.2 m above the road."""
 MARGIN_PX = 2.0
 MIN_CONTRAST = 14.0
 """Least difference in grey levels by which a bar is brighter (or yellower) than both its sides."""
@@ -55,8 +55,8 @@ def find_segments(picture: NDArray[np.uint8], horizon_px: float) -> Segments:
 
 
 def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
-    """Return the grey level of each pixel minus the larger one of the two pixels `reach` (rows,) px
-    to its left and right; 0 where one of them is outside the picture."""
+    """Return the grey level of each pixel minus the larger grey level of two pixels, `reach`
+    (rows,) px to its left and to its right; 0 where one of these two is outside the picture."""
     width = level.shape[1]
     columns = np.arange(width)
     shift = np.rint(reach).astype(np.int64)[:, None]

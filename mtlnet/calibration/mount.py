@@ -1,9 +1,9 @@
 """Estimates a camera's mount from many pictures of a drive: robust means and their spread.
 
 Pitch and yaw are computed from the vanishing point of the markings on straight road, and from the
-point towards which the camera travels. The roll is the one for which the measured width of the lane
-does not depend on the car's position in it. The height is computed from the lane's width. Bends,
-hills and the driver's corrections average out.
+point towards which the camera travels. The roll is estimated as the angle for which the measured
+width of the lane does not depend on the car's position in the lane. The height is computed from the
+lane's width. Bends, hills and the driver's corrections average out.
 """
 
 from collections.abc import Sequence
@@ -37,8 +37,8 @@ MIN_SLOPE = 0.25
 lanes."""
 ROLL_PRIOR = np.radians(2.0)
 FLOOR = np.radians(0.1)
-"""Standard deviation (rad) due to the car itself: it moves on its springs and does not run exactly
-straight."""
+"""Standard deviation (rad) of the car's own angles: the car moves on its springs and does not run
+exactly straight."""
 MAX_TURN = 0.06
 """Yaw rate, rad/s, above which the direction of travel differs from the direction of the car."""
 WINDOW_S = 0.65
@@ -87,8 +87,8 @@ class Mount:
 
 @dataclass(frozen=True)
 class _Roads:
-    """The road fits of N pictures: an array (N,) for each quantity. `lane`: difference of the
-    slopes of the own lane's markings."""
+    """The road fits of N pictures: an array (N,) for each quantity. `x0`, `y0`, `y0_std` and `bend`
+    are the fields of RoadFit. `lane`: difference of the slopes of the own lane's markings."""
 
     time_s: FloatArray
     x0: FloatArray

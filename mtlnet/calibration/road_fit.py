@@ -23,7 +23,7 @@ MIN_CROSSING = 0.8
 vanishing point."""
 POINTING_STD = 0.008
 MIN_LINE_WEIGHT = 0.05
-"""Least total height of the segments of a marking."""
+"""Least sum of the extents in y (normalised coordinates) of a marking's segments."""
 BEND_STD = 0.004
 """Standard deviation of the prior of b: a radius of 150 m for a camera 1.2 m above the road."""
 MAX_FIT_STD = 0.02
@@ -48,8 +48,8 @@ class Lines:
         )
 
     def turned(self, roll: float) -> "Lines":
-        """Return the segments as this camera would see them if it had no roll. `roll`: its roll,
-        rad."""
+        """Return the segments as the camera would see them if it had no roll. `roll`: roll of the
+        camera, rad."""
         c, s = np.cos(roll), np.sin(roll)
         along = c + self.slope * s  # the vertical part of (slope, 1) after the rotation
         return Lines(
@@ -63,9 +63,9 @@ class Lines:
 
 @dataclass(frozen=True)
 class RoadFit:
-    """The fit of one picture, in normalised coordinates: vanishing point x0, y0, and bend b.
-    `y0_std` is the standard deviation of y0 from the fit alone, without the movement of the car on
-    its springs."""
+    """The fit of one picture, in normalised coordinates: vanishing point x0, y0, and `bend`, which
+    is b in the formula of this module. `y0_std` is the standard deviation of y0 from the fit alone,
+    without the movement of the car on its springs."""
 
     x0: float
     y0: float

@@ -151,8 +151,8 @@ def own_markings(
     (2, 34, 2), which has room for 34 points of each.
 
     `lines`: polylines (points, 2), px; `beside` (2,): distances to the two markings, m, negative to
-    the left. A polyline is assigned to a marking by its near end, as if the road were level there;
-    lanes are at least 2.7 m wide.
+    the left. A polyline is assigned to a marking by its near end, as if the road were level there.
+    The assignment is unique, because lanes are at least 2.7 m wide, more than twice `APART_M`.
     """
     nearest = np.full(SIDES, APART_M)
     drawn = [line for line in lines if len(line)]

@@ -43,12 +43,12 @@ def evaluate(
     """Evaluate a model on one split of a dataset; returns the report for all frames and by group
     (`mtlnet.evaluation.metrics`).
 
-    `engines`: the same model once per thread. `data`: folder of a dataset, or of a user's own
-    pictures, which have no splits. `split`: train, test, unseen or all. `report(done, total)` is
-    called after each chunk of frames. `page`: an HTML file to write, or its folder; `worst`: a JPEG
-    to write of the frames with the largest errors. `every`: evaluate every n-th frame only, because
-    consecutive frames are similar. `copies`: value of `--copies`, for a user's own pictures. Raises
-    UserError when the data do not fit the model.
+    `engines`: the same model, loaded once for each thread. `data`: folder of a dataset, or of a
+    user's own pictures, which have no splits. `split`: train, test, unseen or all. `report(done,
+    total)` is called with numbers of frames after every 32 frames. `page`: an HTML file to write,
+    or its folder; `worst`: a JPEG to write of the frames with the largest errors. `every`: evaluate
+    every n-th frame only, because consecutive frames are similar. `copies`: value of `--copies`,
+    for a user's own pictures. Raises UserError when the data do not fit the model.
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
@@ -124,7 +124,7 @@ def evaluate_custom_images(
 
 def about(engine: Engine) -> dict[str, Any]:
     """Return the entries of a report that describe the model: its name, the hash of its weights,
-    the engine and the precision."""
+    the engine, the precision, and the number of views of each image whose answers are averaged."""
     return {
         "model": engine.card.name,
         "model_hash": engine.card.model_hash,
@@ -189,8 +189,8 @@ def require_fit(card: ModelCard, frames: Frames, split: str) -> None:
     """Raise ModelError when the frames' camera differs from the model's camera, or when the card
     does not describe the training data.
 
-    For the splits test and unseen, also when the model was trained on one of the rounds; for
-    unseen, also when it was trained on one of the tracks.
+    For the splits test and unseen, ModelError is also raised when the model was trained on one of
+    the rounds of `frames`; for unseen, also when it was trained on one of their tracks.
     """
     require_camera(card, frames.camera)
     if "mean" not in card.data:

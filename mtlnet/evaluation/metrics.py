@@ -250,10 +250,10 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
 def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float | None]:
     """Return the losses of the paper's table, on coded values, including inactive distances.
 
-    `distance`: the squared errors of the five distances, summed as in training, mean over the
-    frames; `angle`: the mean squared error of the angle; `distance_absolute`, `angle_absolute`: the
-    same with absolute errors; `type`: cross-entropy of the class, None where no frame has a known
-    class.
+    `distance`: the sum of the squared errors of the five distances, averaged over the frames, as in
+    training; `angle`: the mean squared error of the angle; `distance_absolute`, `angle_absolute`:
+    like `distance` and `angle`, with absolute instead of squared errors; `type`: cross-entropy of
+    the class, None where no frame has a known class.
     """
     target = tf.encode(labels.distances, labels.angle).astype(np.float64)
     known = ~np.isnan(target)

@@ -58,11 +58,11 @@ def evaluate_protocol(
     """Evaluate a model by the paper's protocol; returns the report on the held-out rounds, whose
     entry `protocol` has the rows of the paper's table.
 
-    A row is for a drive, a part of a drive, or all held-out rounds that are no drive. Its entry
-    `paper` has the paper's figures. `protocol`: must be "paper". `every`: evaluate every n-th frame
-    only. `report(done, total)` is called with numbers of frames. Raises UserError for another
-    protocol and for data without the rounds of the protocol, ModelError for a model that was
-    trained on these rounds or on dirt-3.
+    A row is for a drive (one of `DRIVES`), a part of a drive, or all rounds that are not in
+    `DRIVES`. Its entry `paper` has the paper's figures. `protocol`: must be "paper". `every`:
+    evaluate every n-th frame only. `report(done, total)` is called with numbers of frames. Raises
+    UserError for another protocol and for data without the rounds of the protocol, ModelError for a
+    model that was trained on these rounds or on dirt-3.
     """
     if protocol != PAPER:
         raise UserError(f"there is no protocol {protocol!r}; give {PAPER}")
@@ -127,9 +127,9 @@ def protocol_rows(
     """Return the rows of the table by name: drives, four intervals of heavy shadow, held-out rounds
     of nine tracks.
 
-    `outputs` (N, K; columns: `split_outputs`); `rows`: the result of `drive_rows`; `every`: the
-    frames are every n-th frame of the rounds; `held_out`: the report on the held-out rounds that
-    are no drive.
+    `outputs` (N, K; columns: `split_outputs`); `rows`: the result of `drive_rows`; `every`: n if
+    the frames are every n-th frame of the rounds; `held_out`: the report on the rounds that are not
+    in `DRIVES`.
     """
     shaded = rows[SHADED]
     window = max(1, INTERVAL_FRAMES // every)

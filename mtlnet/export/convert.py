@@ -2,8 +2,9 @@
 
 With f32 the weights stay as trained. With bf16 large weights (arrays of at least 256 values) are
 stored in bf16, and the graph converts them to float32. int8 is possible for OpenVINO only
-(`mtlnet.export.int8`); the engine uses an int8 graph by default if it has passed its accuracy gate
-on the test rounds. Each export is compared with torch on frames of a dataset.
+(`mtlnet.export.int8`). The engine uses an int8 graph by default if the graph has passed the
+accuracy gate: its errors on the test rounds are at most a little larger than the errors in float32.
+Each export is compared with torch on frames of a dataset.
 
 ONNX and OpenVINO models take any number of images at once (first axis, "batch") and give the same
 answers as for single images. The int8 graph takes one image, as the engine does, because a graph

@@ -1,12 +1,14 @@
-"""Quantises a graph to int8 (by NNCF), and judges it by the accuracy gate.
+"""Quantises a graph to int8 (by NNCF), and judges it by the accuracy gate, which limits the
+increase of each error over float32 on the test rounds (`LIMITS`).
 
 The weights of all convolutions and of all shared layers except the last are quantised. The
 activations of most convolutions are quantised too, calibrated on training frames. Greedy forward
 selection chooses the convolutions that keep float activations, until the errors grow by at most
-half the gate's limits on train rounds that were held out of the training (for another dataset: on a
-twelfth of its train rounds). The gate itself uses the test rounds, on which nothing is chosen. The
-fully connected layers are memory-bound. The last one is small but loses as much accuracy in int8 as
-the other two together, so it stays in float.
+half the gate's limits on train rounds that were held out of the training. (If the export uses a
+dataset without these held-out rounds, a twelfth of its train rounds is used instead.) Nothing is
+chosen on the test rounds. The fully connected layers are memory-bound. The last fully connected
+layer before the heads is small but loses as much accuracy in int8 as the other two together, so it
+stays in float.
 """
 
 import logging
@@ -57,10 +59,11 @@ def choose_float_activations(
 
     `model`: an `openvino.Model`; `images` (N, H, W, 3): frames for the calibration; `mean`: means
     of the training labels. The choices are tried in this order: no convolution; each convolution
-    alone, from the fewest multiplications up; the best of these with each other convolution; up to
-    three convolutions. The first choice with which no error grows by more than half its limit
-    (`LIMITS`) is returned; if there is none, the choice with the smallest growth. For a network
-    with more than 16 convolutions, nothing is tried and `FLOAT_ACTIVATIONS` is returned.
+    alone, from the fewest multiplications up; the best single convolution together with each second
+    one; the best pair together with each third one. The first choice with which no error grows by
+    more than half its limit (`LIMITS`) is returned; if there is none, the choice with the smallest
+    growth relative to the limits. For a network with more than 16 convolutions, nothing is tried
+    and `FLOAT_ACTIVATIONS` is returned.
     """
     rows = np.linspace(0, len(held_out) - 1, min(HELD_OUT_FRAMES, len(held_out))).astype(np.int64)
     frames, labels = held_out.read_batch(rows), model_labels(held_out).take(rows)

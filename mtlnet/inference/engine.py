@@ -71,9 +71,9 @@ def load_engine(
     `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate and
     is reliable on this processor (`uses_int8`), else bf16 if the processor supports it, else
     float32. The torch engine supports only float32; with `gpu` it computes on a GPU if there is
-    one. `threads`: number of CPU threads for one image. `views`: 1, 2 or 6 views of each image,
-    whose outputs are averaged; the time is proportional to it. Raises ModelError when the model is
-    missing, unfinished or damaged.
+    one. `threads`: number of CPU threads for one image. `views`: number of views of each image
+    whose outputs are averaged, 1, 2 or 6; the time is proportional to this number. Raises
+    ModelError when the model is missing, unfinished or damaged.
     """
     card = read_card(run)
     engine = _load_plain(run, card, kind, precision, threads, gpu=gpu)
@@ -229,9 +229,9 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
     """Return whether int8 is the default precision of a run on this processor.
 
     True if the run has an int8 graph of the card's weights that passed its accuracy gate
-    (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor that does not
-    can round sums differently; on such a processor it is true only if the gate was judged without
-    native int8, too.
+    (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor without native
+    int8 can round sums differently. So on this kind of processor int8 is the default only if the
+    gate was also evaluated without native int8.
     """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:

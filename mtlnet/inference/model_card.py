@@ -24,10 +24,11 @@ RUNS = Path("runs")
 CARD, WEIGHTS, GRAPH, GRAPH_WEIGHTS = "card.json", "model.safetensors", "model.xml", "model.bin"
 UNCERTAINTY_WEIGHTS = "uncertainty.safetensors"
 MODEL_FILES = (WEIGHTS, GRAPH, GRAPH_WEIGHTS)
-FORMAT = 6  # 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5: `uncertainty`
+# Additions by format: 2: `network`; 3: the uncertainty head; 4: the camera's pitch; 5:
+# `uncertainty`; 6: short entries for the rounds.
+FORMAT = 6
 LISTING_FORMAT = 5
-"""An earlier format, whose cards list every round; it can still be read
-(`mtlnet.inference.trained_rounds`)."""
+"""The earlier format that can still be read; its cards list every round."""
 
 
 class ModelError(UserError):

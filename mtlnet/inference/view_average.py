@@ -20,14 +20,16 @@ Image = NDArray[np.uint8]
 Outputs = NDArray[np.float32]
 
 COUNTS = (1, 2, 6)
-"""Numbers of views that can be averaged: the image; and mirrored; and turned left and right."""
+"""Numbers of views that can be averaged. 1: the image; 2: also the mirrored image; 6: also both of
+these turned to the left and to the right."""
 TURN_RAD = 0.04
 """Angle by which the camera is turned, rad. A turned view adds this angle to the answered angle,
 and moves the distances. The two directions cancel each other in the mean."""
 STD_FACTORS = {1: 1.0, 2: 0.84, 6: 0.74}
 """Ratio of the standard deviation of the mean's error to the mean of the views' standard
-deviations, by the number of views. With it the shares of errors within one standard deviation are
-those of a single view; measured for the shipped models (docs/experiments/views.md)."""
+deviations, by the number of views. With this factor the share of errors within one standard
+deviation is the same as for a single view; measured for the shipped models
+(docs/experiments/views.md)."""
 
 _SWAP = {"ml": "mr", "mr": "ml", "l": "r", "r": "l"}
 _FROM = [FEATURES.index(_SWAP.get(name, name)) for name in FEATURES]

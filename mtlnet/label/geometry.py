@@ -94,11 +94,12 @@ def _refine(
     free: NDArray[np.bool_],
     steps: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Fit the `values` (5,) in the mask `free` (5,) by the Levenberg-Marquardt method; returns the
-    sum of squares, px^2, and all values.
+    """Fit those of the five `values` (ml and mr in m, angle in rad, curvature in 1/m, pitch in
+    degrees) that the mask `free` (5,) selects, by the Levenberg-Marquardt method. Returns the sum
+    of the squared residuals, px^2, and all five values.
 
     The sum is infinite if a point is not on the road; a search that starts with an infinite sum
-    ends with one. `sides` (N,): 0 for points on the left marking, 1 for the right.
+    ends with an infinite sum. `sides` (N,): 0 for points on the left marking, 1 for the right.
     """
     names = np.flatnonzero(free)
     residual = _residuals(camera, pixels, sides, values)
@@ -137,7 +138,7 @@ def _residuals(
     values: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the lateral distances (N,) of the points `pixels` (N, 2) from their marking, converted
-    to px; infinite above the horizon."""
+    to px; infinite above the horizon. `sides` and `values`: as for `_refine`."""
     ml, mr, angle, curvature, pitch = values.tolist()
     x, y = replace(camera, pitch_deg=pitch).road_points(pixels).T
     along = x * np.cos(angle) + y * np.sin(angle)

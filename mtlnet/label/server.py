@@ -79,7 +79,8 @@ class Drag(BaseModel):
 
 class Label(BaseModel):
     """The body of a request to save a picture's label: `ml` and `mr` in m, `angle` in rad,
-    `curvature` in 1/m, `pitch_deg` in degrees; `heading` is "" if it follows from the curvature."""
+    `curvature` in 1/m, `pitch_deg` in degrees. `heading` is "" if the class follows from the
+    curvature. `drive` and `light`: cells of `labels.csv`; None leaves a cell as it is."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -81,8 +81,9 @@ class Network(nn.Module):
         self.register_buffer("target_std", torch.ones(6), persistent=batch_norm)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Compute the outputs (B, 9) float32, six coded values and three class scores, for images
-        (B, 210, 280, 3): uint8, or float with colours in [-1, 1]."""
+        """Compute the outputs (B, 9) float32 for images (B, 210, 280, 3), uint8 or float with
+        colours in [-1, 1]: five coded distances, the coded angle (`trackfeatures.coding`) and three
+        class scores before the softmax."""
         return self.forward_heads(self.forward_features(images))
 
     def forward_features(self, images: Tensor) -> Tensor:
@@ -101,8 +102,8 @@ class Network(nn.Module):
         return grid
 
     def forward_heads(self, x: Tensor) -> Tensor:
-        """Compute six coded values and three class scores (B, 9) from last shared features
-        (B, 256)."""
+        """Compute five coded distances, the coded angle and three class scores before the softmax
+        (B, 9) from the last shared features (B, 256)."""
         # float32 also under autocast: coded values differ little, and the heads are small.
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
@@ -192,10 +193,10 @@ def predict_images(network: Network, images: NDArray[np.uint8]) -> NDArray[np.fl
 
 
 class SamePad(nn.Module):
-    """Zero padding before `layer`, which has none of its own: both together compute TensorFlow's
-    SAME padding.
+    """Zero padding before a layer without padding of its own. Padding and layer together give the
+    result of the layer with TensorFlow's SAME padding.
 
-    `height`, `width`: size in px of the map that is padded.
+    `layer`: the description of the layer; `height`, `width`: size in px of the map that is padded.
     """
 
     def __init__(self, height: int, width: int, layer: Conv | Pool) -> None:

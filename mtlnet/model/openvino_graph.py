@@ -6,8 +6,8 @@ The heads, the uncertainty head and the texture features of the out-of-distribut
 computed in float32 even if all other layers are in bf16, because OpenVINO rounds the results of a
 MatMul to bf16. The steps of bf16 are 0.004 near 1, which is 0.025 m or 0.005 rad for a head with
 coded values. One MatMul of the uncertainty head stays in bf16: the product with
-`texture_directions`. The score is the sum of its squares, which then has an error of 0.1 %, at most
-0.5 %.
+`texture_directions`. The out-of-distribution score is the sum of the squared elements of this
+product; bf16 changes the score by 0.1 %, at most by 0.5 %.
 """
 
 import errno

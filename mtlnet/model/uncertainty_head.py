@@ -15,7 +15,7 @@ out of distribution if the value is above 1.
   (Lee et al. 2018). The last shared features are unsuitable, because a network trained on roads
   maps other images near their mean. In a measurement with a model trained for 230 steps, at 1 %
   false alarms, the last shared features detected 1 % of noise and text images, the texture features
-  all of them.
+  detected all of these images.
 - The square of the camera's pitch offset, predicted by two layers from the texture features of the
   image centre: a camera that looks up or down sees the same textures slightly higher or lower.
 """
@@ -51,9 +51,10 @@ class TwoLayers(nn.Module):
 class UncertaintyHead(nn.Module):
     """The head with the weights of `state`, a state dict of this module.
 
-    In shapes F is the number of inputs, D of track features, C of texture values of the cells, M of
-    texture values of the image centre. Raises KeyError for a missing tensor, RuntimeError for
-    shapes that do not fit each other.
+    In shapes F is the number of inputs of the layers that predict standard deviations, D = 7 the
+    number of features with a standard deviation, C the number of texture values of all cells, and M
+    the number of texture values of the image centre. Raises KeyError for a missing tensor,
+    RuntimeError for shapes that do not fit each other.
     """
 
     centre: Tensor  # (F,)

@@ -74,7 +74,7 @@ def predict_files(
         if source.problem and len(sources) > 1:  # the problem of a single source is the error
             note(source.problem)
     if not usable:
-        outputs = ()  # what an earlier run wrote stays
+        outputs = ()  # files that an earlier command wrote are kept
     sources = [with_lens(source, camera, lens, note, calibrate=calibrate) for source in sources]
     answers = _Answers(engine, sum(source.count for source in sources), report)
     with ExitStack() as stack:

@@ -51,9 +51,9 @@ class DecodingErrors:
         """Return the coded size (width, height) of the present pictures in px if it does not fit
         the first picture, which has the shape `shape` (H, W, 3); else None.
 
-        A coded size fits if it is less than 16 px larger, because it is rounded up to a multiple of
-        16 px, and also with width and height exchanged, because OpenCV may have rotated the
-        picture.
+        A coded size fits if it is less than 16 px larger than the picture, because coded sizes are
+        rounded up to a multiple of 16 px. It also fits if it does so with width and height
+        exchanged, because OpenCV may have rotated the picture.
         """
         if self.size is None:
             return None
@@ -102,7 +102,7 @@ def decoding_errors() -> Iterator[DecodingErrors]:
             elif size := SIZE.search(told):
                 found.size = (int(size[1]), int(size[2]))
 
-    callback = LogCallback(add)  # must outlive its use
+    callback = LogCallback(add)  # a reference must exist as long as FFmpeg can call it
     library.av_log_set_callback(callback)
     try:
         yield found

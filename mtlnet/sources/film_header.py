@@ -176,7 +176,7 @@ def _matroska_track(file: BinaryIO, start: int, end: int) -> Iterator[str]:
 
 
 def _float(file: BinaryIO, start: int, end: int) -> float:
-    """The float in an EBML element; 0 if it has another size."""
+    """The float in an EBML element; 0 if the element does not have 4 or 8 bytes."""
     file.seek(start)
     data = file.read(end - start)
     form = {4: ">f", 8: ">d"}.get(len(data))

@@ -39,8 +39,8 @@ class LensFinder(Protocol):
     """Interface of an object that finds the camera of a stream while its pictures arrive."""
 
     def at(self, picture: Picture) -> Lens:
-        """Return the lens for `picture`: that of the camera that was found, before that an assumed
-        lens. Must be called for each picture in order."""
+        """Return the lens for `picture`: the lens of the camera that was found or, as long as no
+        camera was found, an assumed lens. Must be called for each picture in order."""
 
 
 class Pictures(Protocol):

@@ -20,9 +20,9 @@ from mtlnet.training.recipes import MOMENTUM, Recipe
 MUON_LAYERS = ("features.", "shared.fc0.")
 """Prefixes of the names of the convolutions and of the first shared layer."""
 MUON_MAX_SIDE = 1024
-"""Maximum of the shorter side of these layers' matrices; AdamW trains larger ones. The cost of a
-step grows with the square of this side: a matrix of network `deepdriving` has a shorter side of
-4096, and Muon's step then takes twenty seconds on two cores."""
+"""Maximum of the shorter side of the matrices of `MUON_LAYERS`; AdamW trains larger matrices. The
+cost of a step grows with the square of the shorter side: a matrix of network `deepdriving` has a
+shorter side of 4096, and Muon's step then takes twenty seconds on two cores."""
 MUON_MAX_SHARED_SIDE = 512
 """Maximum of the longer side of the matrix of a shared layer other than the first."""
 MUON_LR_SCALE = 8.0
@@ -123,7 +123,7 @@ def uses_muon(name: str, weight: Tensor) -> bool:
 
 def as_matrix(weight: Tensor) -> Tensor:
     """Return a layer's weights (F, C, H, W) or (F, C) as a matrix (F, H * W * C) or (F, C), which
-    shares their memory if they are channels-last.
+    shares the memory of `weight` if the weights are channels-last.
 
     The columns are in the order of channels-last memory; Muon does not depend on their order.
     """

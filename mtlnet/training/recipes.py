@@ -4,7 +4,7 @@ finished model further for hours, `tune` to fine-tune a model on few images.
 `paper`: SGD with momentum 0.9, batch 32, learning rate 0.001 times 0.9 every 10,000 steps, 150,000
 steps. Dropout 0.5 and L2 5e-4 are our choice, because the paper states neither.
 
-`fast` differs as follows.
+`fast` differs from `paper` as follows.
 
 - Batch normalisation of the convolutions in training, folded away afterwards: training is several
 times faster. The shared layers are not normalised: batch statistics add noise to the distances.
@@ -36,8 +36,9 @@ reduced the number of wrong classes to 0.89 and the angle's error to 0.97 of the
 With a learning rate of 1e-3 the model lost more of its former training than it gained by the new
 frames. The learning rate is constant until the last fifth of the run, then
 falls to zero as one minus a square root (Hägele et al. 2024, "Scaling Laws and Compute-Optimal
-Training Beyond Fixed Training Durations"). So a run that is stopped before that can be prolonged
-(`--resume --minutes`) as if it had been planned longer from the start.
+Training Beyond Fixed Training Durations"). So a run that is stopped before its last fifth can be
+prolonged (`--resume --minutes`), with the same result as if it had been started with the longer
+duration.
 
 On a GPU `fast` and `continue` take `gpu_batch` images per step unless `--batch` is given, and every
 recipe scales its learning rate by `learning_rate_factor`.

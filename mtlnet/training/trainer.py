@@ -26,8 +26,8 @@ from runtime.processor import has_bf16
 MIN_TARGET_STD = (0.01,) * 6
 """Lower bounds (6,) of the standard deviations of the coded targets, the units of the heads."""
 FINE_TUNE_MIN_STD = (0.15,) * 5 + (0.03,)
-"""The same bounds in fine-tuning, where a few images can be nearly identical: the standard
-deviations in varied driving."""
+"""Lower bounds (6,) for fine-tuning: the standard deviations in varied driving. They are larger,
+because the few images of a fine-tuning can be nearly identical."""
 MIN_STEPS_BEFORE_BN_FREEZE = 100
 """Minimum number of steps before batch normalisation is frozen: earlier, its running statistics
 still depend on the initial weights."""
@@ -89,8 +89,9 @@ class Trainer:
             torch.manual_seed(dropout_seed(self.seed, self.rank.index, self.step_number))
 
     def standardise(self, loader: Loader, *, fine_tune: bool = False) -> None:
-        """Set `target_mean` and `target_std` of the network, the zero and unit of the heads'
-        outputs, to the mean and standard deviation of the coded training targets.
+        """Set `target_mean` and `target_std` of the network to the mean and standard deviation of
+        the coded training targets. A head's output is a coded value minus this mean, divided by
+        this standard deviation.
 
         `fine_tune`: the training starts from a finished model, perhaps with few images. The lower
         bounds of the standard deviations are then 0.15 for a distance and 0.03 for the angle, else

@@ -35,7 +35,7 @@ class FrameOutputs:
     An error is NaN where the label or, for `to_lane_centre`, the prediction is absent.
     """
 
-    x: NDArray[np.float32]  # (N, F) inputs of the uncertainty head, the last of them the light
+    x: NDArray[np.float32]  # (N, F) inputs of the uncertainty head, light features last
     error: NDArray[np.float32]  # (N, D) m and rad
     texture: NDArray[np.float32]  # (N, T)
 
@@ -77,10 +77,10 @@ def _run_torch(
 def _run_openvino(
     network: Network, frames: Images, chosen: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the network's outputs (N, 9), the inputs of the head without the light (N, F) and the
-    textures (N, T) for the N `chosen` frames.
+    """Return the network's outputs (N, 9), the inputs of the uncertainty head without the light
+    features (N, F), and the texture features (N, 1040), for the N frames with the indices `chosen`.
 
-    One OpenVINO request per core computes them, three times as fast as torch in float32.
+    One OpenVINO request per core computes these arrays, three times as fast as torch in float32.
     """
     x = np.empty((len(chosen), network.architecture.uncertainty_inputs), np.float32)
     outputs = np.empty((len(chosen), OUTPUTS), np.float32)

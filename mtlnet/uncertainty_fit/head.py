@@ -255,8 +255,8 @@ def _rms_error(error: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _temperatures(ratio: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return factors (D,) for the predicted standard deviations, from the ratios (N, D) of the
-    errors to them.
+    """Return the factors (D,) by which the predicted standard deviations are to be multiplied, from
+    the `ratio` (N, D) of each error to its predicted standard deviation.
 
     A feature present in fewer than `MIN_PRESENT_FRAMES` frames gets the median factor of the other
     features.
@@ -268,11 +268,12 @@ def _temperatures(ratio: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _temperature(ratio: NDArray[np.float32]) -> float:
-    """Return the factor that minimises the larger deviation of the two shares from `COVERED`, from
-    the ratios (N,) of one feature.
+    """Return the factor for the predicted standard deviations of one feature, from the `ratio` (N,)
+    of each error to its predicted standard deviation.
 
-    Because of outliers no factor gives both shares: with the factor that gives the first share, the
-    second share is too small.
+    With this factor the shares of errors within one and two standard deviations are as close as
+    possible to `COVERED`: the larger of the two deviations is minimal. Because of outliers no
+    factor gives both shares; with the factor that gives the first share, the second is too small.
     """
     candidates = np.quantile(ratio, np.linspace(0.6, 0.9, 61))
     limits = np.outer([1.0, 2.0], candidates)

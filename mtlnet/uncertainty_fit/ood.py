@@ -47,8 +47,8 @@ CELL_NOISE = 1 / 255
 all alike is not out of distribution."""
 PITCH_UNIT_RAD = 0.1  # unit of the regression target
 MIN_PITCH_LIMIT_RAD = 0.02
-"""A predicted pitch below this value (rad) is never out of distribution, even if the pitches of few
-frames vary less."""
+"""A predicted pitch whose absolute value (rad) is below this limit is never out of distribution,
+even if the pitches predicted for the held-out frames, when these are few, vary less."""
 HIDDEN = 64
 
 

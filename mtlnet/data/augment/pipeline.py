@@ -31,11 +31,13 @@ SHIFT_SHARE, ROTATION_SHARE, SHADOW_SHARE, PATCH_SHARE = 0.3, 0.3, 0.15, 0.125
 BLUR_SHARE, NOISE_SHARE, JPEG_SHARE = 0.08, 0.12, 0.0625
 BORDER_SHARE = 0.5
 MAX_BORDER = (0.3, 0.3, 0.25, 0.25)
-"""Maximum shares of rows and columns without a picture at the top, bottom, left and right."""
+"""Maximum shares of the rows (top, bottom) and columns (left, right) that a border covers with
+grey. `BORDER_SHARE` of the images have borders."""
 NARROW_SHARE = 0.15
 """Share of images with borders like those of the narrowest field of view that is not refused."""
 LOWEST_EDGE = 0.55
-"""Minimum share of the rows above the lower border of these images, so that they show some road."""
+"""Minimum share of an image's rows that lie above its lower border, for the images of
+`NARROW_SHARE`, so that they show some road."""
 MAX_PATCH_SIDE = 0.3  # relative to the image's sides
 BLUR_STD_PX, NOISE_STD, JPEG_QUALITY = (0.4, 1.4), (2.0, 12.0), (25, 90)
 
@@ -45,7 +47,7 @@ class AugmentParams:
     """Augmentation parameters of B images. Where a parameter is 0, its change is not made; `colour`
     is always applied."""
 
-    shift: NDArray[np.float64]  # (B,) m to the left; until `resolve_lateral_shift` a share
+    shift: NDArray[np.float64]  # (B,) m to the left; a share before `resolve_lateral_shift`
     rotation: NDArray[np.int64]  # (B,) number of one of `ROTATIONS`
     mirrored: NDArray[np.bool_]  # (B,)
     shadow: NDArray[np.int64]  # (B,) number of one of `SHADOWS`

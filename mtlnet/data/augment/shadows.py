@@ -17,7 +17,7 @@ SHADOWS = 64  # number of shadows; number 0 is no shadow
 DARKNESS = (0.3, 0.75)  # share of the light that a shadow removes
 COVERED = (0.15, 0.7)  # share of the road that is shaded
 CELL_M = 0.08  # size of a cell of the noise field from which shadows are cut
-LEAF_CELLS, CROWN_CELLS = 3.0, 14.0  # standard deviations of the blur: leaves, crowns
+LEAF_CELLS, CROWN_CELLS = 3.0, 14.0  # standard deviations, in cells, of the blur of leaves, crowns
 MAX_DISTANCE_M = 40.0  # beyond this distance from the camera a shadow is uniform
 FIELD = 1024  # cells per side
 

@@ -1,5 +1,6 @@
-// Labels pictures: the geometry is the server's (POST fit), the page draws and drags. Pixels are
-// those of the whole picture; `view.scale` is canvas pixels for each of them.
+// Labels pictures. The server computes the geometry (POST fit), the page draws the markings and lets
+// the user drag them. Points are in pixels of the whole picture; `view.scale` is the number of
+// canvas pixels for each picture pixel.
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), ink = canvas.getContext("2d");
@@ -166,11 +167,11 @@ for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind,
   const held = drag;
   if (!held) return;
   await fit();
-  if (drag === held) drag = null; // else the next one has begun
+  if (drag === held) drag = null; // otherwise the next drag has begun
   draw();
 });
 
-// One request at a time; the last position counts.
+// Sends one request at a time; of the positions that are dragged in the meantime, the last is sent.
 async function fit() {
   if (busy) { again = true; return waiting; }
   busy = true;

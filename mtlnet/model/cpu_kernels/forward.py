@@ -22,15 +22,15 @@ MAX_IM2COL_PIXELS = 64
 
 
 FAST = (MTL.features, GRID.features, GRID_RESIDUAL.features)
-"""Architectures (`Architecture.features`) whose convolutions this module implements."""
+"""The lists of layers (`Architecture.features`) of the networks that this module implements."""
 
 
 def training_outputs(
     network: Network, images: Tensor, dtype: torch.dtype, masks: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Compute the network's outputs (B, 9) float32, six coded values and three class scores, for
-    images uint8 (B, 210, 280, 3). The heads are computed in float32, all layers before them in
-    `dtype`.
+    """Compute the network's outputs (B, 9) float32 for images uint8 (B, 210, 280, 3): five coded
+    distances and the coded angle (`trackfeatures.coding`), and three class scores before the
+    softmax. The heads are computed in float32, all layers before them in `dtype`.
 
     `masks`: for each shared layer a dropout mask (B, units) with values 0 or 1 / (1 - probability);
     empty: no dropout.

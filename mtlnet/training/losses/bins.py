@@ -1,11 +1,12 @@
 """The loss of a network with heads over bins (`mtlnet.model.bins`).
 
-The loss of the distances is the cross-entropy with the target distributions, mean over the five
-distances and the batch. (The paper sums its squared errors over the five; a sum of cross-entropies
-outweighed angle and class in a pilot of 300 steps.) The loss of the angle is the cross-entropy plus
-the Huber error of the distribution's mean, in bins, as in Ruiz et al. 2018 for head pose, because
-the cross-entropy alone does not depend on how far a wrong bin is from the right one. The loss of
-the class is the cross-entropy. Alpha weights the three tasks as in the paper.
+The loss of the distances is the cross-entropy with the target distributions, averaged over the five
+distances and the batch. (The paper sums its squared errors over the five distances. A sum of the
+cross-entropies outweighed the losses of angle and class in a pilot of 300 steps.) The loss of the
+angle is the cross-entropy plus the Huber error of the distribution's mean, in bins, as in Ruiz et
+al. 2018 for head pose, because the cross-entropy alone does not depend on how far a wrong bin is
+from the right bin. The loss of the class is the cross-entropy. The task weights alpha multiply the
+losses of the three tasks, as in the paper.
 """
 
 from collections.abc import Callable
