@@ -54,7 +54,8 @@ class SupervisorConnection:
                 logger.debug("the supervisor has ended")
 
     def send_loaded(self, generation: int, engine: Engine) -> None:
-        """Tell the supervisor which engine was loaded for this generation of weights."""
+        """Send the supervisor the hash of the weights, the kind and the precision of `engine`,
+        which was loaded for this generation of weights."""
         self.send(
             loaded=generation,
             model=engine.card.model_hash,
@@ -107,7 +108,7 @@ def load(folder: Path, expected: str | None, *, views: int) -> Engine:
 
 
 def send_ready(supervisor: SupervisorConnection) -> None:
-    """Tell the supervisor that this worker now answers images."""
+    """Send the supervisor the message that this worker can answer images."""
     # The objects loaded so far are permanent. With them a full garbage collection delays all
     # clients by 50 to 80 ms, several times per minute; without them it takes 3 ms.
     gc.freeze()

@@ -2,10 +2,11 @@
 
 Inputs: `image` (BYTES [1, 1], the bytes of a JPEG or PNG file) or `pixels` (UINT8 [1, height,
 width, 3], RGB). Outputs, float32: `distances_m` (1, 5) in the order ml, mr, l, m, r, NaN if absent;
-`std` (1, 7) in the order of the distances, offset, angle (m and rad); `out_of_distribution` 0 or 1;
-`absent` (1, 5) in the order of the distances; `to_lane_centre_m`, `angle_rad` and `heading` as in
-POST /features. The options of an image are the same as for POST /features, in headers, in the
-query, or in `parameters`.
+`std` (1, 7), the standard deviations of these distances and of the offset from the lane centre (m),
+and of the angle (rad); `out_of_distribution` (1, 1), 0 or 1; `absent` (1, 5), the probabilities of
+absence in the order of the distances; `to_lane_centre_m` (1, 1), `angle_rad` (1, 1) and `heading`
+(1, 3) as in POST /features. The options of an image are the same as for POST /features, in headers,
+in the query, or in `parameters`.
 """
 
 import asyncio

@@ -205,7 +205,8 @@ def merge_options(headers: Headers, options: Mapping[str, Any], where: str) -> H
 
 
 def check_names(options: Mapping[str, Any], known: Mapping[str, Any], where: str) -> None:
-    """Raise Problem for options in `where` that are not `known`."""
+    """Raise Problem if a name in `options` is not in `known`. `where` is the source of the options,
+    for the message."""
     unknown = next((name for name in options if name not in known), None)
     if unknown is not None:
         raise Problem(
@@ -257,7 +258,8 @@ def parse_format(accept: bytes | None, formats: Formats = FORMATS) -> ResponseFo
 
 
 def parse_name(sent: bytes | None, header: str) -> str | None:
-    """Return the name or id in a header's value `sent`; None without the header. Raises Problem."""
+    """Return the name or id in `sent`, the value of a header; None without the header. `header` is
+    the header's name, for the message. Raises Problem."""
     if sent is None:
         return None
     if not is_name(sent):

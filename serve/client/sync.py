@@ -101,12 +101,13 @@ class Client:
         """Send `image`, the bytes of a JPEG or PNG file, to POST /features; return the answer with
         its track features. Raises ServiceError.
 
-        `content_type` is detected from the first bytes if it is None. `stream` names a stream of
-        frames, in which a newer frame replaces a queued one. `fov_y_deg` is the vertical field of
-        view of the image; the default is the value of the model's camera. `camera` names a camera
-        that the service was started with. `deadline_s` is the time from now to the deadline. The
-        service drops the frame after the deadline. Until then the request is retried if the service
-        is overloaded, not ready, or restarting.
+        `content_type` is detected from the first bytes if it is None. `frame_id` is returned in the
+        answer. `stream` names a stream of frames, in which a newer frame replaces a queued frame.
+        `fov_y_deg` is the vertical field of view of the image in degrees; the default is the value
+        of the model's camera. `camera` names a camera that the service was started with.
+        `deadline_s` is the time in s from now to the deadline. The service drops the frame if its
+        processing has not begun by the deadline. Before the deadline the request is retried if the
+        service is overloaded, not ready, or restarting.
         """
         if content_type is None:
             content_type = "image/png" if image.startswith(PNG_SIGNATURE) else "image/jpeg"

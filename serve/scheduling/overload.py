@@ -52,8 +52,9 @@ class Admission:
         self._credit: dict[Client, tuple[float, int]] = {}  # (remaining ms, at this time in ns)
 
     def admit(self, client: Client, cost_ms: float, now_ns: int) -> Callable[[], None]:
-        """Admit a large image with the estimated decoding time `cost_ms`; `now_ns` is monotonic.
-        Returns a function to call when the image is done. Raises Problem if it is refused."""
+        """Admit a large image with the estimated decoding time `cost_ms`, at the time `now_ns` of
+        the monotonic clock. Returns a function, which the caller must call when the image has been
+        processed. Raises Problem if the image is refused."""
         client = network_of(client)
         own = self._client_ms.get(client, 0.0)
         if own and own + cost_ms > MAX_CLIENT_MS:

@@ -63,7 +63,9 @@ class RateLimiter:
         cells[at + 1] = left - 1.0
 
     def _bucket(self, key: float, now: float) -> int:
-        """Index of the client's bucket. A new client gets the oldest bucket, filled again."""
+        """Index in `cells` of the bucket of the client with this `key`. A new client gets, full,
+        the bucket that was not used for the longest time among its 8 possible buckets (PROBES).
+        `now`: s of the monotonic clock."""
         cells = self._cells
         first = int(key) % CLIENT_ENTRIES
         indices = [(first + n) % CLIENT_ENTRIES * CLIENT_WORDS for n in range(PROBES)]

@@ -22,7 +22,7 @@ TOLERANCE = {"f32": 2e-3, "bf16": 0.03, "int8": 0.1}
 
 def warm_up(engine: Engine) -> None:
     """Run `engine` three times on the synthetic image. Raises ModelError if an output differs from
-    the published one by more than the tolerance of the engine's precision (TOLERANCE)."""
+    the published output by more than the tolerance of the engine's precision (TOLERANCE)."""
     card = engine.card
     image = golden_image(card.camera.width, card.camera.height)
     if isinstance(engine, ViewAverage):  # the published outputs are not averaged

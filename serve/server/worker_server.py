@@ -60,7 +60,8 @@ class WorkerServer(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Stop the worker on SIGTERM; ignore the other signals, which the supervisor handles."""
+        """Within the context, stop the worker on SIGTERM, and ignore SIGINT, SIGHUP and SIGUSR2,
+        which the supervisor handles."""
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self.handle_exit)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR2):
