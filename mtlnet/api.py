@@ -147,8 +147,8 @@ class Model:
         pictures of a recording.
 
         Raises UserError for a source that cannot be used (ImageError for one image). An iterator
-        raises UserError after the last image, if any image could not be used. Messages about the
-        sources found, and about skipped ones, go to the logger `mtlnet`.
+        raises UserError after the last image, if any image could not be used. Messages about files
+        that are skipped and about cameras that are found go to the logger `mtlnet`.
         """
         lens = self._lens(camera, fov_y_deg)
         if isinstance(source, str | Path):

@@ -191,8 +191,8 @@ def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) 
 
 
 def read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """Read the evaluation of a finished run; None if it is missing or damaged, or if the run's
-    weights have changed since."""
+    """Read the evaluation of the run in `folder`; None if the evaluation is missing or damaged, or
+    if the run's weights have changed since the evaluation."""
     if not (folder / EVALUATION).is_file() or not (folder / CARD).is_file():
         return None
     try:

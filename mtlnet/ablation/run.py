@@ -179,7 +179,7 @@ def step_seconds(
 COLOURS = ("#3b6fd4", "#e07a2e", "#2a9d5c", "#c23b6b")
 SINGLE_TASK_COLOUR = "#6a3fb5"  # the paper's purple line
 FINAL_SHARE = 0.05
-"""The final loss of a run is the mean over this share of its steps, the last ones."""
+"""Share of the logged points, at the end of a run, over which the final loss is averaged."""
 PAPER_DIGITS = {"distance_absolute": 5, "angle_absolute": 5, "accuracy": 2}
 """The columns for which the page also shows the paper's figures, with the number of decimal places
 of these figures. The paper does not define its losses exactly."""

@@ -28,7 +28,7 @@ SHOWN = 6
 
 Picture = NDArray[np.uint8]
 MakeLens = Callable[[tuple[int, int]], KnownLens]
-"""A function that returns the lens of pictures of a size (width, height)."""
+"""A function that returns the lens of pictures of a size (width, height), px."""
 Report = Callable[[float, float], None]
 """A function that is called with what is done so far and the total, both in s of a film or in
 numbers of pictures."""

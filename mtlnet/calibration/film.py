@@ -168,8 +168,9 @@ class DriveCalibration:
         return self._estimate(mount)
 
     def _motions(self, start: tuple[float, float]) -> list[TimedMotion]:
-        """Return the camera's motions between followed pictures. The direction of travel of each is
-        searched near `start`, in the second round near the median direction of the first round."""
+        """Return the camera's motions between followed pictures. The direction of travel of each
+        motion is searched near `start`, the film's vanishing point (x, y) in normalised
+        coordinates; in the second round, near the median direction of the first round."""
         noise, towards = TRACK_NOISE_PX / self._view.focal_px, np.array(start)
         motions: list[TimedMotion] = []
         for _ in range(MOTION_ROUNDS):

@@ -68,7 +68,8 @@ def _bars(level: NDArray[np.float32], reach: FloatArray) -> NDArray[np.float32]:
 
 
 def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Segments:
-    """Fit straight segments to the bars of `response` (rows, columns), whose first row is `top`."""
+    """Fit straight segments to the bars in `response` (rows, columns). `top`: the picture's row
+    that is the first row of `response`; `reach` (rows,): maximum width of a bar in each row, px."""
     noise = 1.4826 * float(np.median(np.abs(response)))
     mask = response > max(MIN_CONTRAST, 2.0 * noise)
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
@@ -88,7 +89,8 @@ def _segments(response: NDArray[np.float32], top: int, reach: FloatArray) -> Seg
 
 
 def _fit_lines(piece: NDArray[np.int64], v: NDArray[np.int64], u: FloatArray) -> Segments:
-    """Fit u over v by least squares to the points of each `piece`; drop short or curved pieces."""
+    """Fit a line u(v) by least squares to the points (u, v), px, of each piece; drop short or
+    curved pieces. `piece` (points,): number of the piece to which a point belongs."""
     n = np.bincount(piece).astype(np.float64)
     mean_u, mean_v = np.bincount(piece, u) / n, np.bincount(piece, v) / n
     du, dv = u - mean_u[piece], v - mean_v[piece]

@@ -42,7 +42,7 @@ class Motion:
 def follow(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FloatArray | None:
     """Follow points between two grayscale images (H, W); returns (N, 4): u and v in px in `before`,
     then in `after`. None if fewer than 40 points can be followed, or if fewer than a quarter of
-    them move by 0.5 px."""
+    them move by at least 0.5 px."""
     seen = np.full(before.shape, 255, np.uint8)
     seen[round((1 - BONNET) * len(seen)) :] = 0
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.005, MIN_SPREAD_PX, mask=seen)

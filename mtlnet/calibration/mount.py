@@ -177,8 +177,9 @@ def _lane_widths(fits: Sequence[RoadFit], lane_width_m: float) -> FloatArray:
 
 
 def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
-    """Return the rate of change (N,) of `place` (N,) over `time` (N,), from the values within
-    WINDOW_S; NaN where there are too few values or the car changes lanes."""
+    """Return the rate of change (N,) of the car's lateral position `place` (N,) over `time` (N,) in
+    s, for each time from the values within WINDOW_S; NaN where there are too few values or the car
+    changes lanes."""
     found = np.full(len(time), np.nan)
     for k in range(len(time)):
         near = (np.abs(time - time[k]) <= WINDOW_S) & np.isfinite(place)
@@ -193,9 +194,10 @@ def _sideways(time: FloatArray, place: FloatArray) -> FloatArray:
 
 def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
     """Return the correction of `roll` after which the measured width of the lane does not depend on
-    the car's position in it, and the standard deviation of the corrected roll, both in rad.
+    the car's position in the lane, and the standard deviation of the corrected roll, both in rad.
 
-    A roll r widens a lane by 1 + 2 r c, where c is the mean slope of its two markings.
+    `widths`: see `_Roads.widths`. A roll r multiplies the measured width of a lane by 1 + 2 r c,
+    where c is the mean slope of its two markings.
     """
     found, weight = [-roll], [ROLL_PRIOR**-2]
     own = widths[widths[:, 3] == 1]
@@ -215,7 +217,8 @@ def _roll_left(widths: FloatArray, roll: float) -> tuple[float, float]:
 
 
 def _vanishing_point(roads: _Roads, rows: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the vanishing point x0, y0 of straight road for a car that moves along the road."""
+    """Return the vanishing point x0, y0 of straight road for a car that moves along the road, from
+    the fits with the indices `rows`."""
     weight = 1.0 / (roads.y0_std[rows] ** 2 + 0.004**2)
     y0 = robust.mean(roads.y0[rows], weight)
     speeds = np.isfinite(roads.sideways[rows])

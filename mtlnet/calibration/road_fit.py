@@ -88,7 +88,7 @@ def fit_road(lines: Lines, x0: float, y0: float) -> RoadFit | None:
 
 def _crossing(lines: Lines, x0: float, y0: float) -> tuple[float, float, FloatArray] | None:
     """Return x and y of the vanishing point to which most segments point, and the slopes of the
-    markings; None without such a point."""
+    markings; None if no vanishing point is found near (`x0`, `y0`), the film's vanishing point."""
     first, second = np.triu_indices(len(lines.x), 1)
     crossing = np.abs(lines.slope[first] - lines.slope[second]) > MIN_CROSSING
     first, second = first[crossing], second[crossing]
@@ -152,12 +152,13 @@ def _refine(lines: Lines, x0: float, y0: float, slopes: FloatArray) -> RoadFit |
 
 
 def _below(lines: Lines, y0: float) -> FloatArray:
+    """Return the distance in y (N,) of each segment below the horizon, at least half MIN_BELOW."""
     return np.asarray(np.maximum(lines.y - y0, 0.5 * MIN_BELOW), np.float64)
 
 
 def _slope_std(lines: Lines, below: FloatArray) -> FloatArray:
     """Return the standard deviation (N,) of the difference between the slopes of a segment and of
-    its marking, including the effect of an uneven road."""
+    its marking, including the effect of an uneven road. `below` (N,): see `_below`."""
     return np.asarray(np.hypot(lines.slope_std, 0.02 + 0.004 / below), np.float64)
 
 
@@ -167,7 +168,8 @@ def _members(
     """Assign the segments to markings; returns a mask of the segments that lie on a kept marking,
     the index of each segment's marking among the kept markings, and a mask of the kept markings.
 
-    `wide`: factor on the allowed distance of a segment from its marking.
+    `state`: x0, y0, b and the slope of each marking. `wide`: factor on the allowed distance of a
+    segment from its marking.
     """
     x0, y0, bend = state[:3]
     slopes, below = state[3:], _below(lines, y0)
@@ -185,8 +187,9 @@ def _equations(
     lines: Lines, marking: NDArray[np.int64], state: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the design matrix (2 N + 1, P) and the errors (2 N + 1,) of the positions and slopes
-    of the segments, divided by their standard deviations and weighted by Huber's weights. The
-    caller fills the last row with the prior of b."""
+    of the N segments, divided by their standard deviations and weighted by Huber's weights. The
+    caller fills the last row with the prior of b. `state` (P,): x0, y0, b and the slope of each
+    marking; `marking` (N,): index of each segment's marking."""
     x0, y0, bend = state[:3]
     s, a, n = _below(lines, y0), state[3:][marking], len(lines.x)
     own = 3 + marking

@@ -20,8 +20,8 @@ SMOOTHING_CELLS = 2.0
 
 def find_vanishing_point(pictures: Iterable[Lines]) -> tuple[float, float] | None:
     """Return the vanishing point x0, y0, in normalised coordinates, of the segments of all
-    pictures; None if no segment points into the searched range, 16 degrees to both sides and 13 up
-    and down."""
+    pictures; None if no segment points into the searched range: 16 degrees to the left and right,
+    13 degrees up and down."""
     across, down = (np.arange(-reach, reach + STEP_DEG / 2, STEP_DEG) for reach in REACH_DEG)
     y0 = np.tan(np.radians(down))
     votes = np.zeros((len(down), len(across)))

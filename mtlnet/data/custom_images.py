@@ -253,10 +253,11 @@ def _prepared(
     target: CameraParameters,
     copy: str,
 ) -> NDArray[np.uint8] | ImageError:
-    """Return one copy of a picture as seen by the model's camera `target`.
+    """Return the copy, of kind `copy`, of the picture `image` in the file `path`, as seen by the
+    model's camera `target`.
 
-    Returns an ImageError for a copy that shows too little of that camera's view; raises all other
-    errors.
+    `source`: the picture's camera; None: the model's camera. Returns an ImageError for a copy that
+    shows too little of the view of `target`; raises all other errors.
     """
     if copy != PLAIN:
         image = copied_picture(image, source or target, copy)

@@ -41,7 +41,7 @@ class LabelArrays(Protocol):
 
     @property
     def distances(self) -> NDArray[np.float32]:
-        """Distances (N, 5) in m, NaN where absent."""
+        """Distances (N, 5) in m, NaN where absent, infinity where the label is unknown."""
 
     @property
     def angle(self) -> NDArray[np.float32]:
@@ -91,8 +91,8 @@ class Batch:
 
 @dataclass(frozen=True)
 class BatchLabels:
-    """A batch without its images. It has the rows of its frames, their augmentation parameters
-    (None without augmentation), and their labels after the augmentation."""
+    """A batch without its images: the row numbers of its frames (`chosen`), their augmentation
+    parameters (None without augmentation), and their labels after the augmentation."""
 
     chosen: NDArray[np.int64]  # (B,)
     params: AugmentParams | None
@@ -178,7 +178,7 @@ class Loader:
         self, chosen: NDArray[np.int64], params: AugmentParams | None = None
     ) -> NDArray[np.float32]:
         """Return the labels of the road ahead (B, A) of the frames `chosen` (B,), augmented with
-        `params`; A is 0 if the loader has none."""
+        `params`; A is 0 if the loader has no labels of the road ahead, else 28."""
         if self._ahead is None:
             return np.zeros((len(chosen), 0), np.float32)
         return self._ahead.labels(chosen, params)

@@ -44,8 +44,8 @@ def hold_out_rounds(dataset: Dataset) -> tuple[Frames, Frames | None]:
     the uncertainty head is fitted. With fewer than eight train rounds, all are trained on, and the
     second result is None.
 
-    The division depends only on the set of rounds. The next held-out round is always the one whose
-    track and lights are rarest among the rounds already held out.
+    The division depends only on the set of rounds. The next held-out round is always the round
+    whose track and lights are rarest among the rounds that are already held out.
     """
     rounds = [info for info in dataset.rounds if info.split == "train"]
     conditions = {info.id: {info.track, *info.lights} for info in rounds}

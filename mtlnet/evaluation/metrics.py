@@ -122,10 +122,10 @@ GROUPS = {
     "by_speed": "speed",
 }
 SHADOW = (0.05, 0.3, 0.6)
-"""Limits between groups of the share of the road within 30 m that lies in shadow."""
+"""Limits between the groups: share of the road within 30 m ahead that is in shadow."""
 RADIUS_M = (40.0, 80.0, 170.0)
-"""Limits between groups of the radius of the bend, m; a road with a larger radius has the class
-straight."""
+"""Limits between the groups, m. A larger radius than 170 m at the car's position does not count as
+a bend; the class is then straight, unless there is a bend 20 m ahead."""
 SPEED_KMH = (30.0, 45.0, 60.0)
 
 
@@ -248,7 +248,8 @@ def _ratios(model: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
 
 
 def coded_losses(outputs: NDArray[np.float32], labels: LabelArrays) -> dict[str, float | None]:
-    """Return the losses of the paper's table, on coded values, including inactive distances.
+    """Return the losses of the paper's ablation table, on coded values, including inactive (absent)
+    distances.
 
     `distance`: the sum of the squared errors of the five distances, averaged over the frames, as in
     training; `angle`: the mean squared error of the angle; `distance_absolute`, `angle_absolute`:

@@ -157,8 +157,8 @@ def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
     an array of frame indices (window,), in the order of the frames.
 
     `shadow` (N,): share of the road in shadow. The darkest interval is chosen first, then the
-    darkest one that does not overlap it, and so on. If N is too small for four intervals, they are
-    shorter.
+    darkest interval that does not overlap it, and so on. If N is too small for four intervals of
+    `window` frames, the intervals are shorter.
     """
     window = max(1, min(window, len(shadow) // (2 * INTERVALS - 1)))
     sums = np.convolve(shadow.astype(np.float64), np.ones(window), mode="valid")
@@ -173,9 +173,10 @@ def darkest_intervals(shadow: NDArray[np.float32], window: int) -> list[Rows]:
 def drive_figures(outputs: NDArray[np.float32], labels: Labels) -> dict[str, Any]:
     """Return the results of a drive or of a part of a drive.
 
-    `distance_m`, `angle_rad`: mean absolute errors; `largest_...`: the largest errors; `zero_...`:
-    the errors of always answering zero, which are the mean sizes of the labels; `absent`: frames
-    without an answered distance, which have no error; `heading_accuracy`: share of correct classes.
+    `distance_m`, `angle_rad`: mean absolute errors of the offset from the lane centre and of the
+    angle; `largest_...`: the largest errors; `zero_...`: the mean absolute errors of always
+    answering zero; `absent`: number of frames without an answered offset, which have no error;
+    `heading_accuracy`: share of correct classes.
     """
     errors = np.abs(signed_errors(outputs, labels.distances, labels.angle))
     distance, angle = (errors[:, FEATURES.index(f)] for f in ("to_lane_centre", "angle"))

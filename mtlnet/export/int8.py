@@ -31,9 +31,10 @@ from runtime.processor import has_int8
 
 CALIBRATION_FRAMES = 300
 FLOAT_ACTIVATIONS: tuple[int, ...] = (0, 2)
-"""Default numbers of the convolutions with float activations. In the paper's network, quantising
-the activations of the first convolution costs more distance accuracy than quantising all others
-together, and quantising those of the third costs more angle accuracy than all others together."""
+"""Default numbers, from 0, of the convolutions with float activations. In the paper's network,
+quantising the activations of the first convolution costs more distance accuracy than quantising the
+activations of all other convolutions together. Quantising the activations of the third convolution
+costs more angle accuracy than all other convolutions together."""
 MAX_FLOAT_ACTIVATIONS, MAX_CONVOLUTIONS = 3, 16
 """Maximum number of convolutions with float activations; maximum number of convolutions of a
 network for which they are searched. A network with more convolutions gets `FLOAT_ACTIVATIONS`."""

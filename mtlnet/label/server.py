@@ -118,9 +118,9 @@ class Labeller:
         """Return what the page shows for picture `number`: name, size in px, row of `labels.csv`,
         and the markings with their lines and handles in px (`shown`).
 
-        The markings are those of the label; without a label the markings that the model finds;
-        without either, the markings of a lane 3.6 m wide with the car in its middle. `source`
-        states which.
+        The markings come from the label; without a label from the model's answer; if the model
+        finds no lane either, they are the markings of a lane 3.6 m wide with the car in its middle.
+        `source` states which of these three cases applies: "label", "model" or "usual".
         """
         image = self.folder.picture(number)
         height, width = image.shape[:2]

@@ -26,8 +26,9 @@ no gradient."""
 def load_pretrained(
     network: Network, weights: Path, images: NDArray[np.uint8] | None = None, name: str = ""
 ) -> None:
-    """Set the weights of `network` so that it computes the outputs of a finished model.
-    `target_mean` and `target_std`, the zero and unit of the heads' outputs, do not change.
+    """Set the weights of `network` so that it computes the outputs of a finished model. The
+    network's `target_mean` and `target_std`, with which a head of coded values converts its output
+    to a coded value, do not change.
 
     `weights`: the model's file. `images` uint8 (B, 210, 280, 3): images on which the statistics of
     the batch normalisation are measured; None for a network without batch normalisation. `name`:

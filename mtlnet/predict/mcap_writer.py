@@ -107,7 +107,8 @@ class McapWriter:
         """Log time in ns since 1970 of an image with the time `time_s`, s. An image without a time
         follows one frame interval after the last image.
 
-        The times of each film and round start at 0; consecutive ones are placed one after another.
+        The times of each film and round start at 0; in the file, consecutive films and rounds are
+        placed one after another.
         """
         if time_s is None:
             time = self._last_ns + self._step_ns if self._last_ns else topics.EPOCH_NS

@@ -52,7 +52,7 @@ class DecodingErrors:
         the first picture, which has the shape `shape` (H, W, 3); else None.
 
         A coded size fits if it is less than 16 px larger than the picture, because coded sizes are
-        rounded up to a multiple of 16 px. It also fits if it does so with width and height
+        rounded up to a multiple of 16 px. It also fits if this is true with width and height
         exchanged, because OpenCV may have rotated the picture.
         """
         if self.size is None:

@@ -59,8 +59,8 @@ class HuberLoss:
     """The Huber loss (Huber 1964) of errors in standard deviations of their targets, with gains.
 
     An error is squared up to `distance_beta` or `angle_beta` standard deviations and linear beyond.
-    Where a distance has two possible values, the minimum is then at the likelier one, while a
-    squared error has its minimum in between. The angle does not jump, so its beta is large.
+    Where a distance has two possible values, the Huber loss is minimal at the likelier value, while
+    the squared error is minimal in between. The angle does not jump, so its beta is large.
 
     The gains multiply the terms of distance and angle. Without gains the cross-entropy of the
     class, which stays large, outweighs both terms. With gains the distances are learned far better,
@@ -165,7 +165,8 @@ WARM_UP_STEPS = 500
 """Maximum number of warm-up steps if the rate is constant afterwards: longer runs do not need more,
 and a prolonged run must not warm up again."""
 DECAY, DECAY_STEPS = 0.9, 10_000
-"""Factor of the learning rate, and steps between two applications of it (sgd)."""
+"""Factor by which the learning rate is multiplied, and number of steps between two multiplications
+(sgd)."""
 
 
 def find_recipe(name: str) -> Recipe:

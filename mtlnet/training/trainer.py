@@ -90,8 +90,8 @@ class Trainer:
 
     def standardise(self, loader: Loader, *, fine_tune: bool = False) -> None:
         """Set `target_mean` and `target_std` of the network to the mean and standard deviation of
-        the coded training targets. A head's output is a coded value minus this mean, divided by
-        this standard deviation.
+        the coded training targets. A head of coded values outputs a coded value minus this mean,
+        divided by this standard deviation.
 
         `fine_tune`: the training starts from a finished model, perhaps with few images. The lower
         bounds of the standard deviations are then 0.15 for a distance and 0.03 for the angle, else

@@ -32,7 +32,8 @@ class FrameOutputs:
     the last ten are the light features, `error` (N, 7) in m and rad, and texture features `texture`
     (N, 1040).
 
-    An error is NaN where the label or, for `to_lane_centre`, the prediction is absent.
+    An error is NaN where the label is absent or unknown; the error of `to_lane_centre` is also NaN
+    where the prediction is absent.
     """
 
     x: NDArray[np.float32]  # (N, F) inputs of the uncertainty head, light features last
@@ -44,8 +45,8 @@ def run_on_frames(network: Network, frames: Images, limit: int) -> FrameOutputs:
     """Run `network` on up to `limit` evenly spaced frames, and return the results that the fit of
     the uncertainty head needs.
 
-    If OpenVINO is installed, it computes them, in bf16 on a CPU that supports bf16 natively, else
-    in float32. Without OpenVINO torch computes them in float32.
+    If OpenVINO is installed, OpenVINO runs the network, in bf16 on a CPU that supports bf16
+    natively, else in float32. Without OpenVINO, torch runs it in float32.
     """
     chosen = np.linspace(0, len(frames) - 1, min(limit, len(frames))).astype(np.int64)
     run = _run_openvino if has_openvino() else _run_torch

@@ -57,8 +57,9 @@ FIT = FitSettings(steps=1_000, batch=256, learning_rate=1e-2, weight_decay=3e-2)
 FOLDS = 8
 MIN_FRAMES_TO_DIVIDE = 8
 """Without held-out frames, every second train frame determines the limits of the
-out-of-distribution score, if there are at least this many train frames. With fewer, all train
-frames determine them, because otherwise half of these would be out of distribution."""
+out-of-distribution score, if there are at least this many train frames. With fewer train frames,
+all of them determine the limits, because otherwise half of the train frames would be out of
+distribution."""
 MIN_PRESENT_FRAMES = 30  # least number of frames for a feature's own temperature
 MIN_STD_SHARE, MAX_STD_SHARE = 0.01, 20.0
 """Limits of a standard deviation, relative to the RMS error. The lower limit is small, because a
@@ -98,10 +99,10 @@ def fit_uncertainty_head(
 ) -> FittedUncertainty:
     """Fit the uncertainty head of `network` (folded) on its train frames and on held-out frames.
 
-    Without held-out frames it is fitted on the train frames alone, and its standard deviations are
-    too small; the model card then lists no held-out rounds. In that case the light features are not
-    inputs of the head, because so few rounds do not show enough sceneries. `camera`: the camera of
-    the frames; None: the default camera.
+    Without held-out frames the head is fitted on the train frames alone, and its standard
+    deviations are too small; the model card then lists no held-out rounds. In that case the light
+    features are not inputs of the head, because a dataset with too few rounds for held-out rounds
+    does not show enough sceneries. `camera`: the camera of the frames; None: the default camera.
     """
     count = network.architecture.uncertainty_inputs
     known = run_on_frames(network, train, MAX_TRAIN_FRAMES)

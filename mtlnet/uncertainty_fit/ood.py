@@ -43,8 +43,8 @@ MAX_PITCH_RAD, MAX_LOG_ZOOM = 0.26, 0.5
 of half the field of view."""
 PITCH_FRAMES, VIEWS_PER_FRAME = 1_500, 2
 CELL_NOISE = 1 / 255
-"""Half a grey level. An image that differs by this much in each cell from training images that are
-all alike is not out of distribution."""
+"""Half a grey level, on the scale -1 to 1 of the texture features. If all training images are
+equal, an image that differs from them by this much in each cell is not out of distribution."""
 PITCH_UNIT_RAD = 0.1  # unit of the regression target
 MIN_PITCH_LIMIT_RAD = 0.02
 """A predicted pitch whose absolute value (rad) is below this limit is never out of distribution,
@@ -126,7 +126,7 @@ def pitched_views(
     frames: Images, camera: CameraParameters, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the texture features (N, M) of the image centre for frames warped to other pitches,
-    and the pitches (N,), rad, positive downwards."""
+    and the pitches (N,) relative to `camera`, rad, positive downwards."""
     rng = np.random.default_rng([seed, 4])
     chosen = np.linspace(0, len(frames) - 1, min(PITCH_FRAMES, len(frames))).astype(np.int64)
     image = np.empty((1, camera.height, camera.width, 3), np.uint8)

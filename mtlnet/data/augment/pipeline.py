@@ -95,8 +95,8 @@ def _draw_patch(count: int, height: int, width: int, rng: np.random.Generator) -
 def _draw_border(
     count: int, height: int, width: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return random borders (B, 4), px at the top, bottom, left and right, like the areas that a
-    camera with a narrower field of view does not show."""
+    """Return random borders (`count`, 4) of images of `height` x `width` px: px at the top, bottom,
+    left and right, like the areas that a camera with a narrower field of view does not show."""
     share = rng.uniform(0.0, MAX_BORDER, (count, 4)) * (rng.random((count, 1)) < BORDER_SHARE)
     shown = rng.uniform(LEAST_SHOWN, 1.0, (count, 2))  # of rows and columns
     first = np.column_stack([np.maximum(LOWEST_EDGE - shown[:, 0], 0.0), np.zeros(count)])

@@ -24,8 +24,8 @@ OFFSETS = {42: ("I", 4), 43: ("Q", 8)}
 
 
 def swaps_sides(orientation: int) -> bool:
-    """Return whether an image of this orientation (1 to 8) is turned by a quarter to be upright, so
-    that its stored height becomes its width."""
+    """Return whether an image of this orientation (1 to 8) must be turned by a quarter turn to be
+    upright, so that its stored height becomes its width."""
     return orientation >= 5
 
 

@@ -1,9 +1,9 @@
 """The multi-task loss (paper, equations 6 to 9): three weighted terms.
 
-Distance: squared error, summed over the five coded distances, mean over the batch. Angle: squared
-error of the coded angle, mean over the batch. Class (the paper's "type"): cross-entropy of the
-class, mean over the batch. The optimizer adds the L2 term: the gradient of lambda |w|^2 is a weight
-decay of 2 lambda.
+Distance: squared error, summed over the five coded distances and averaged over the batch. Angle:
+squared error of the coded angle, averaged over the batch. Class (the paper's "type"): cross-entropy
+of the class, averaged over the batch. The optimizer adds the L2 term lambda |w|^2 of the weights w,
+as a weight decay of 2 lambda, because the gradient of this term is 2 lambda w.
 
 An unknown label (a coded target of NaN, the class `UNKNOWN_HEADING`) has no loss: means are over
 the known labels.

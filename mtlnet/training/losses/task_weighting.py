@@ -81,8 +81,8 @@ class TaskWeighting:
         """For the method `dwa`, add the loss `terms` (3,) of a step, averaged over the whole batch,
         to the sums of the current window; for all other methods do nothing.
 
-        When the window has `window` steps, a new one begins. From the second window on, the end of
-        a window sets new weights.
+        When the window has `window` steps, a new window begins. New weights are computed at the end
+        of each window except the first.
         """
         if self.method != "dwa":
             return
