@@ -181,12 +181,12 @@ def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) 
             given = {k: v for k, v in vars(train_config).items() if k not in ("out", "minutes")}
             train(*resume_config(run.folder, given))
         else:
-            # A folder without a configuration: the process was killed while making it.
+            # Without a configuration the folder is a remnant of a process that was killed early.
             shutil.rmtree(run.folder, ignore_errors=True)
             train(train_config, None)
     result = evaluate(run.folder, config)
     atomic_write(run.folder / EVALUATION, json.dumps(result) + "\n", fsync=True)
-    # More than 200 MB per run, which a finished run does not need.
+    # The checkpoints take more than 200 MB per run, and a finished run does not need them.
     shutil.rmtree(run.folder / CHECKPOINTS, ignore_errors=True)
 
 

@@ -131,7 +131,8 @@ class Loader:
         self.rows = slice(index * batch // parts, (index + 1) * batch // parts)
         shape = (self.rows.stop - self.rows.start, camera.height, camera.width, 3)
         self._buffers = BufferPool(shape)
-        # On varied roads the height of the camera differs between rounds.
+        # On varied roads the height of the camera differs between rounds, so `model_labels`
+        # converts the labels to metres at the model's camera.
         labels = model_labels(frames) if isinstance(frames, Frames) else frames.labels
         self._labels = labels
         self.coded = tf.encode(labels.distances, labels.angle)

@@ -110,7 +110,7 @@ def quantise(
     `float_activations`: indices, in topological order, of the convolutions whose activations stay
     in float.
     """
-    # Otherwise NNCF sends usage statistics.
+    # Without this variable NNCF sends usage statistics.
     os.environ["NNCF_CI"] = "1"
     import nncf
 

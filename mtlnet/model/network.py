@@ -287,7 +287,8 @@ def build_backbone(name: str, *, batch_norm: bool) -> tuple[nn.Module, int]:
     setattr(model, last, nn.Identity())
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):
-            # torchvision's 0.01 suits runs of 100,000 steps; in short runs the means would lag.
+            # torchvision's momentum of 0.01 suits runs of 100,000 steps. In shorter runs the
+            # running means and variances would lag behind the weights.
             module.momentum = NORM_MOMENTUM
     if not batch_norm:
         fold_norms(model)

@@ -7,7 +7,7 @@ extrapolated border is visible.
 
 The field of view of these images varies too but is not predicted: on a straight flat road a wider
 view looks like the view of a higher camera, except for the length of dashes. A regressor of the
-field of view was tried; it detected only 2 to 5 % of the frames.
+field of view was tried; it detected only 2 to 5 % of the frames with another field of view.
 """
 
 from collections.abc import Callable, Iterable

@@ -64,7 +64,7 @@ def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
     margin, reach = tf.IN_LANE_MARGIN_M, tf.ON_MARKING_REACH_M
     in_lane, on_marking = ~np.isnan(ml), ~np.isnan(m)
     low, high = np.full(len(m), -MAX_SHIFT_M), np.full(len(m), MAX_SHIFT_M)
-    # In a lane: at least `margin` from both markings, or `reach` if not also on a marking.
+    # A car in a lane stays at least `margin` from both markings, or `reach` if `m` is absent.
     least = np.where(on_marking | unknown[:, 3], margin, reach)
     low = np.where(in_lane, np.maximum(low, least - mr), low)
     high = np.where(in_lane, np.minimum(high, -least - ml), high)
