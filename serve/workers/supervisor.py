@@ -101,7 +101,8 @@ class Supervisor:
         stopping.cancel()
         if not loading.done():
             loading.cancel()
-            await asyncio.gather(loading, return_exceptions=True)  # else asyncio logs it
+            # Without this await asyncio would log the exceptions of `loading`.
+            await asyncio.gather(loading, return_exceptions=True)
             await self._stop_workers()
             return None
         try:
