@@ -1,6 +1,6 @@
-// Labels pictures. The server computes the geometry (POST fit), the page draws the markings and lets
-// the user drag them. Points are in pixels of the whole picture; `view.scale` is the number of
-// canvas pixels for each picture pixel.
+// Labels pictures. The server computes the geometry (POST fit), the page draws the markings and
+// lets the user drag them. Points are in pixels of the whole picture; `view.scale` is the number
+// of canvas pixels for each picture pixel.
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), ink = canvas.getContext("2d");
