@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     ClassShares = dict[str, dict[str, float]]
 
 DEFAULT_LANES = ",".join(map(str, CollectConfig.lanes))
-PIPE_WIDTH = 120  # characters: width of tables if stdout is no terminal
+PIPE_WIDTH = 120  # width of tables in characters if stdout is not a terminal
 
 Out = Annotated[
     Path | None,
@@ -172,11 +172,13 @@ def record_plan(
     shard: "Shard | None",
     make_law: "MakeLaw | None" = None,
 ) -> "CollectResult":
-    """Record the plan, or its part `shard`, into `folder`, show a progress bar and return the
-    totals.
+    """Record the rounds of `plan`, or only those of its part `shard`, into `folder`. Show a
+    progress bar and return the totals.
 
     `classes` are the forecast shares of the classes of the road, for the table above the bar.
-    `make_law` creates a steering law in place of the default one. Exits with code 130 after Ctrl-C.
+    `workers` is the number of recording processes; 0 means one per core. `executor` is "local" or
+    "ray". `make_law` creates a steering law in place of the default one. Exits with code 130 after
+    Ctrl-C.
     """
     from datagen.execution.collect import collect as run
     from datagen.execution.progress import progress_bar
@@ -227,8 +229,8 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """Return the lane counts in `text`, the value of --lanes, in ascending order. Raises UserError
-    if a part is no number."""
+    """Return the lane counts in `text` in ascending order. `text` is the value of --lanes, numbers
+    separated by commas. Raises UserError for a part that is not a number."""
     try:
         return tuple(sorted({int(part) for part in names(text)}))
     except ValueError as error:

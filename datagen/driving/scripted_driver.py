@@ -16,14 +16,14 @@ from simulator.traffic.traffic import EGO_CAR_SIZE, TRAFFIC_CAR_SIZE, Traffic
 from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 
-NATURAL_FREQUENCY = 2.2  # rad/s of the lateral motion
+NATURAL_FREQUENCY = 2.2  # rad/s: natural frequency of the controlled lateral motion
 DAMPING = 0.85
-MAX_LATERAL_SPEED = 2.4  # m/s, of the target offset
-MAX_PATH_ANGLE = 0.16  # rad, between the path and the road
+MAX_LATERAL_SPEED = 2.4  # m/s: largest speed at which the target offset changes
+MAX_PATH_ANGLE = 0.16  # rad: largest angle between the path and the road
 LANE_CHANGE_SPEED = 1.4  # m/s: largest lateral speed of a lane change
-LANE_CHANGE_RESPONSE = 1.0  # 1/s: lateral speed for each metre that remains
-PASSING_DISTANCE_M = 2.4  # lateral, between the centres of cars side by side
-LANE_CHANGE_PAUSE_S = 4.0  # least time between two lane changes
+LANE_CHANGE_RESPONSE = 1.0  # 1/s: lateral speed (m/s) per metre that the lane change still needs
+PASSING_DISTANCE_M = 2.4  # least lateral distance between the centres of cars side by side
+LANE_CHANGE_PAUSE_S = 4.0  # least time between the starts of two lane changes
 SLOWER_BY = 1.5  # m/s: a car ahead is overtaken if it is slower than the target speed by this much
 
 
@@ -116,16 +116,18 @@ class ScriptedDriver:
         return self._law.steer(state, target, curvature, atan(slope))
 
     def _limit_lateral_speed(self, wanted: float, to_middle: float) -> float:
-        """Move the target offset (m) towards `wanted` for one control step, at most at
-        `MAX_LATERAL_SPEED`, and return it. The first target starts at `to_middle`."""
+        """Move the target offset (m) towards `wanted` (m) for one control step, by at most
+        `MAX_LATERAL_SPEED` times the duration of the step. Return the new target offset. In the
+        first control step, it starts from `to_middle` (m)."""
         before = to_middle if self._steered_for is None else self._steered_for
         most = MAX_LATERAL_SPEED * self._dt
         self._steered_for = min(max(wanted, before - most), before + most)
         return self._steered_for
 
     def _choose_lane(self, state: CarState, traffic: Traffic, driven_m: float) -> None:
-        """Start a lane change when the car ahead is slow and a neighbouring lane is free, and
-        return to the course's lane when there is no car close ahead."""
+        """Start a lane change when the car ahead is slow and a neighbouring lane is free. Return to
+        the course's lane when no car is close ahead. `driven_m` is the distance (m) driven since
+        the start of the round."""
         self._pause_s = max(self._pause_s - self._dt, 0.0)
         road = self._road
         leader = traffic.leader(state.s, state.to_middle)
@@ -148,7 +150,8 @@ class ScriptedDriver:
                 return
 
     def _step_shift(self) -> float:
-        """Advance the lane change by one control step; return its lateral speed (m/s)."""
+        """Move the car's shift from its course by one control step; return the shift's speed (m/s,
+        left positive)."""
         speed = LANE_CHANGE_RESPONSE * (self._shift_target - self._shift)
         speed = min(max(speed, -LANE_CHANGE_SPEED), LANE_CHANGE_SPEED)
         self._shift += speed * self._dt
@@ -156,7 +159,7 @@ class ScriptedDriver:
 
     def _avoid_cars(self, wanted: float, state: CarState, traffic: Traffic) -> tuple[float, bool]:
         """Limit the offset `wanted` (m) to the part of the road without cars alongside. Returns the
-        limited offset, and whether it equals `wanted`."""
+        limited offset, and whether `wanted` lies in this part of the road."""
         low, high = -self._max_offset, self._max_offset
         length = self._road.track.length_m
         near = 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0]) + 2.0 + 0.4 * max(state.speed, 0.0)

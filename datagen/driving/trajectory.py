@@ -19,17 +19,18 @@ FloatArray = NDArray[np.float64]
 
 TRAJECTORIES = ("lane", "offsets", "weave", "lane-changes", "yaw-recoveries", "offset-recoveries")
 OUTSIDE_M = 1.0
-"""Largest distance by which a course lies outside the outermost marking."""
+"""Largest distance (m) by which a course lies outside the outermost marking."""
 BODY_HALF_WIDTH_M = 0.97
 WALL_CLEARANCE_M = 0.75
 EDGE_CLEARANCE_M = 0.7
 MAX_OFFSET_STEP_M = 4.5
-"""Largest change from one offset to the next; with it the angle to the road stays small."""
+"""Largest change (m) from one constant offset to the next. It keeps the angle to the road small."""
 WOBBLE_ANGLE_RAD = 0.024
-"""Standard deviation of the wobble's angle to the road."""
+"""Standard deviation (rad) of the angle to the road that the wobble causes."""
 MIDDLE_WOBBLE = 0.5
-"""Factor on the wobble for the trajectory MIDDLE. With it the mean distance to the middle is 0.17
-m; the paper's vehicles, which drive on their images, have 0.148 and 0.175 m."""
+"""Factor on the wobble for the trajectory MIDDLE. With this factor, the mean distance from the
+middle of the lane is 0.17 m. The two vehicles of the paper, which drive on their images, have mean
+distances of 0.148 m and 0.175 m."""
 
 
 @dataclass(frozen=True)
@@ -85,19 +86,22 @@ def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator
 
 
 def _lane(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A course in one lane, at a small constant offset from its centre."""
+    """Return a course (see `Maker`) in one lane, at a small constant offset from the lane's
+    centre."""
     lane = int(rng.integers(road.lanes))
     centre = tf.lane_centre(lane, road.lanes, road.lane_width)
     return np.full(count, centre + rng.normal(0.0, 0.4)), 1.0
 
 
 def _middle(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A course in the centre of the middle lane, as the paper's vehicle drives."""
+    """Return a course (see `Maker`) in the centre of the middle lane, where the paper's vehicle
+    drives."""
     return np.full(count, tf.lane_centre(road.lanes // 2, road.lanes, road.lane_width)), 1.0
 
 
 def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A course of constant offsets anywhere on the road; the offset changes every 60 to 140 m."""
+    """Return a course (see `Maker`) of constant offsets anywhere on the road. The offset changes
+    every 60 to 140 m."""
     limit = max_offset(road)
     offset = rng.uniform(-limit, limit)
 
@@ -112,7 +116,8 @@ def _offsets(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArr
 
 
 def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A course of sine waves within a lane or over the width of the road; wide waves are long."""
+    """Return a course (see `Maker`) of sine waves. They stay within a lane or extend over the width
+    of the road. The wavelength grows with the amplitude."""
     half = road.lanes * road.lane_width / 2
     if rng.uniform() < 0.5:
         middle = tf.lane_centre(int(rng.integers(road.lanes)), road.lanes, road.lane_width)
@@ -122,13 +127,14 @@ def _weave(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray
         amplitude = rng.uniform(0.4, 0.8) * (half - abs(middle))
     steepest = rng.uniform(0.05, 0.085)
     wave = 2.0 * np.pi * amplitude / steepest
-    # The wavelength drifts: with a constant one, the angle would be a function of the offset.
+    # The wavelength drifts. With a constant wavelength the angle would depend only on the offset.
     phase = np.cumsum(2.0 * np.pi / wave * (1.0 + 0.3 * _noise(count, 80.0, rng)))
     return middle + amplitude * np.sin(phase + rng.uniform(0.0, 2.0 * np.pi)), 1.0
 
 
 def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A course with a lane change every 50 to 130 m; on one lane, with a change of side in it."""
+    """Return a course (see `Maker`) with a lane change every 50 to 130 m. On a one-lane road, it
+    changes between 1.1 m left and 1.1 m right of the lane's centre instead."""
     centres = np.array([tf.lane_centre(n, road.lanes, road.lane_width) for n in range(road.lanes)])
     if road.lanes == 1:
         centres = np.array([-1.1, 1.1])
@@ -143,13 +149,14 @@ def _lane_changes(road: Road, count: int, rng: np.random.Generator) -> tuple[Flo
 
 
 def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """A course in one lane that turns away quickly every 40 to 90 m and returns slowly."""
+    """Return a course (see `Maker`) in one lane. Every 40 to 90 m it turns away from the direction
+    of the lane quickly and returns to its offset slowly."""
     base, _ = _lane(road, count, rng)
     metres = np.arange(count, dtype=np.float64)
     at = rng.uniform(20.0, 60.0)
     while at < count:
         width = rng.uniform(8.0, 14.0)
-        # x * exp(-x / width): its slope at the start is `steepest`.
+        # The factor `steepest` is the slope of the added curve at its start.
         steepest = rng.choice([-1.0, 1.0]) * rng.uniform(0.10, 0.24)
         past = np.maximum(metres - at, 0.0)
         base = base + steepest * past * np.exp(-past / width)
@@ -160,8 +167,8 @@ def _yaw_recoveries(road: Road, count: int, rng: np.random.Generator) -> tuple[F
 def _offset_recoveries(
     road: Road, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, float]:
-    """A course in one lane that is shifted by 1 to 2.4 m every 60 to 110 m and returns after 6 to
-    18 m."""
+    """Return a course (see `Maker`) in one lane. Every 60 to 110 m it is shifted sideways by 1 to
+    2.4 m; after 6 to 18 m it begins to return."""
     base, _ = _lane(road, count, rng)
     at = rng.uniform(20.0, 60.0)
     while at < count:
@@ -175,7 +182,8 @@ def _offset_recoveries(
 
 
 Maker = Callable[[Road, int, np.random.Generator], tuple[FloatArray, float]]
-"""Returns a course's offsets (count,) in m, and the standard deviation (m) of their smoothing."""
+"""A function of road, number of metres `count` and random generator. It returns a course's offsets
+(count,) in m, one per metre, and the standard deviation (m) of the Gaussian that smooths them."""
 _MAKERS: dict[str, Maker] = {
     MIDDLE: _middle,
     "lane": _lane,
@@ -193,8 +201,9 @@ def _steps(
     next_offset: Callable[[], float],
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Piecewise constant offsets (count,) in m, before smoothing. `next_offset` gives each value;
-    its length is random between the two limits `apart_m`."""
+    """Return piecewise constant offsets (count,) in m, one per metre, before smoothing.
+    `next_offset` returns the offset of each piece. The length of a piece is random between the two
+    limits `apart_m` (m)."""
     offset = np.empty(count)
     at = 0
     while at < count:
@@ -205,21 +214,22 @@ def _steps(
 
 
 def _wobble(count: int, rng: np.random.Generator) -> FloatArray:
-    """Slow random drift (count,) of the offset in m, as of an inattentive driver."""
+    """Return a slow random drift (count,) of the offset in m, one value per metre, like the drift
+    of an inattentive driver."""
     noise = _noise(count, 9.0, rng)
     return noise * (WOBBLE_ANGLE_RAD / max(float(np.gradient(noise).std()), 1e-9))
 
 
 def _noise(count: int, length_m: float, rng: np.random.Generator) -> FloatArray:
-    """Noise (count,) with standard deviation 1, one value per metre, correlated over about
+    """Return noise (count,) with standard deviation 1, one value per metre, correlated over about
     `length_m` metres."""
     noise = _smooth(rng.normal(size=count + 64), length_m)[:count]
     return noise / max(float(noise.std()), 1e-9)
 
 
 def _smooth(values: FloatArray, deviation_m: float) -> FloatArray:
-    """Smooth `values` (N,), one per metre, with a Gaussian of standard deviation `deviation_m`. The
-    first and last value continue beyond the ends."""
+    """Smooth `values` (N,), one per metre, with a Gaussian of standard deviation `deviation_m` (m).
+    Beyond the two ends, the first and the last value are repeated."""
     half = int(np.ceil(4.0 * deviation_m))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / deviation_m) ** 2)
     padded = np.pad(values, half, mode="edge")

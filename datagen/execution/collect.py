@@ -42,7 +42,8 @@ PLAN_FILE = "plan.json"
 
 
 class Executor(Protocol):
-    """Records the rounds of `jobs` and returns those that failed (`ProcessPool`, `RayPool`)."""
+    """Interface of `ProcessPool` and `RayPool`. `run` records the rounds of `jobs` and returns the
+    failed rounds."""
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]: ...
 
@@ -50,8 +51,9 @@ class Executor(Protocol):
 def make_pool(executor: str, workers: int, on_message: OnMessage) -> Executor:
     """Create the executor: processes on this machine ("local") or actors on a Ray cluster ("ray").
 
-    `workers` is their number; 0 means one per core. `on_message` receives the progress of each
-    round. Raises UserError for another executor or a negative number.
+    `workers` is the number of processes or actors; 0 means one per core. `on_message` receives the
+    progress of each round. Raises UserError for an unknown executor or a negative number of
+    workers.
     """
     if workers < 0:
         raise tf.UserError(f"{workers} workers asked for; give 1 or more, or 0 for all cores")
@@ -75,14 +77,17 @@ def collect(
     shard: Shard | None = None,
     make_law: "MakeLaw | None" = None,
 ) -> CollectResult:
-    """Record the missing rounds of the plan, or of its part `shard`, into `folder`; return totals.
+    """Record the missing rounds of the plan, or of its part `shard`, into `folder`. Return the
+    totals.
 
-    `workers` is the number of processes, 0 for one per core. `make_law` creates a steering law for
-    each round in place of the scripted driver's; the plan's `driver` must then name it.
+    `workers` is the number of processes; 0 means one per core. `tracks_dir` is a further folder of
+    tracks. `progress` is called with the numbers of recorded frames and rounds. `executor` is
+    "local" or "ray" (see `make_pool`). `make_law` creates a steering law for each round in place of
+    the scripted driver's law; `plan.driver` must then name it.
 
-    Raises DatasetError if the folder has other contents or a round cannot be recorded, and
-    UserError or OSError if recording is impossible (full disk). Finished rounds always stay in
-    `folder`; files of unfinished rounds are removed.
+    Raises DatasetError if the folder contains anything but a dataset of this plan or a round cannot
+    be recorded, and UserError or OSError if recording is impossible (full disk). Finished rounds
+    always stay in `folder`; files of unfinished rounds are removed.
     """
     started = time.perf_counter()
     rounds = plan.rounds if shard is None else shard.select(plan.rounds)
@@ -136,7 +141,7 @@ def _failure_message(failures: Sequence[Failure], planned: int) -> str:
 
 
 def _remove_leftovers(folder: Path, rounds: Sequence[RoundPlan]) -> None:
-    """Delete the unfinished files of these rounds that interruptions have left."""
+    """Delete the files of these rounds that interrupted collections have left unfinished."""
     discard_partials(folder, (entry.id for entry in rounds))
     states = read_states(folder)
     for entry in rounds:
@@ -206,7 +211,8 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
 
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:
-    """List the options and the driver that differ between the plan in the folder and `plan`."""
+    """List the options and the driver that differ between the plan in the folder and `plan`.
+    `found` are the options and `driver` is the driver of the plan in the folder."""
     found = LATER | found
     wanted = json.loads(json.dumps(LATER | plan.config.as_dict()))
     named = [
@@ -231,7 +237,7 @@ def _short(value: Any) -> str:
 
 def initialise_folder(folder: Path, plan: Plan) -> None:
     """Write the plan and the split into `folder` and create its subfolders."""
-    # The plan is written first: with it, the same command can continue after any later failure.
+    # The plan is written first, because the same command needs it to continue after a failure.
     write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
     write_split(split_path(folder), split_of(plan, {entry.id for entry in plan.rounds}))

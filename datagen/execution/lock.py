@@ -20,8 +20,8 @@ FOLDER_LOCK, SETUP_LOCK = "folder", "setting-up"
 
 @contextmanager
 def folder_lock(folder: Path, shard: Shard | None) -> Iterator[None]:
-    """Lock the folder within the block; with `shard` only this shard. Raises DatasetError if
-    another collector holds the lock."""
+    """Lock the folder within the block. With `shard`, lock only this shard of the plan. Raises
+    DatasetError if another collector holds the lock."""
     (folder / LOCKS).mkdir(exist_ok=True)
     with _open(folder, FOLDER_LOCK) as descriptor:
         if not try_lock(descriptor, shared=shard is not None):
@@ -53,8 +53,8 @@ def setup_lock(folder: Path) -> Iterator[None]:
 
 
 def _require_same_count(folder: Path, shard: Shard) -> None:
-    """Raise DatasetError if a collector records a shard of another number of shards: both would
-    record the same rounds."""
+    """Raise DatasetError if a running collector divides the plan into another number of shards than
+    `shard.count`. The two collectors would record the same rounds."""
     for path in sorted((folder / LOCKS).glob("shard-*-of-*")):
         if path.name.endswith(f"-of-{shard.count}"):
             continue

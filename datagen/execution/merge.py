@@ -89,7 +89,9 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
 def _copy_rounds(
     found: Mapping[str, tuple[Path, RoundState]], round_ids: Sequence[str], out: Path
 ) -> None:
-    """Copy these rounds into `out`. Readers refuse the dataset until its split lists them."""
+    """Copy the rounds with the ids `round_ids` into `out`. `found` contains the folder and the
+    state of each round by id. Readers refuse the dataset until its split lists the copied
+    rounds."""
     if round_ids:
         begin_merge(out)
     for round_id in round_ids:
@@ -97,8 +99,9 @@ def _copy_rounds(
 
 
 def _derive(out: Path, planned: Mapping[str, str]) -> tuple[dict[str, RoundState], dict[str, Any]]:
-    """Write split, statistics, card and manifest of the finished rounds in `out`; return the states
-    of these rounds and the statistics."""
+    """Write split, statistics, card and manifest of the finished rounds in `out`. `planned`
+    contains the side of the split of each planned round by id. Return the states of the finished
+    rounds by id, and the statistics."""
     states = {i: state for i, state in read_states(out).items() if i in planned}
     if not states:
         end_merge(out)
@@ -123,7 +126,8 @@ def _read_plan(folder: Path) -> dict[str, Any]:
 
 
 def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
-    """The common plan of shards; for different plans, a plan of all their rounds.
+    """Return the common plan of `plans` if they are equal, otherwise a plan of all their rounds.
+    `folders` are the folders of the plans, for error messages.
 
     Raises DatasetError if different plans share a round id or a seed. With a shared seed, the same
     road in the same scenery could be in training and in test.
@@ -171,7 +175,7 @@ def _copy_round(folder: Path, state: RoundState, out: Path) -> None:
         publish(out, partial, state)
     except BaseException:
         if not partial.exists() and state.id not in read_states(out):
-            round_path(out, state.id).unlink(missing_ok=True)  # it was moved, its state is missing
+            round_path(out, state.id).unlink(missing_ok=True)  # moved here, but without a state
         raise
     finally:
         discard_partial(out, state.id)

@@ -15,7 +15,7 @@ from datagen.recorder.job import FramesDone, Job, Message, worker_main
 from runtime.worker_threads import thread_limits
 
 STOP_S = 5.0  # s: time that a process has to end before it is killed
-CONTEXT = multiprocessing.get_context("spawn")  # graphics contexts do not survive a fork
+CONTEXT = multiprocessing.get_context("spawn")  # because graphics contexts do not survive a fork
 
 
 @dataclass
@@ -122,7 +122,8 @@ class ProcessPool:
             self._queue.record_outcome(job, message)
 
     def _replace(self, number: int, reason: str) -> None:
-        """Replace worker `number`, whose process has ended; its round is tried again."""
+        """Start a new process for worker `number`, whose process has ended, and queue the round of
+        the ended process again. `reason` describes the end, for the error message."""
         ended = self._workers[number]
         ended.connection.close()
         ended.process.join()
@@ -157,8 +158,8 @@ def _code(process: BaseProcess) -> int | None:
 
 @contextmanager
 def _single_threaded(workers: int) -> Iterator[None]:
-    """Set the environment variables of `thread_limits` within the block. Libraries in the child
-    processes read them when they are loaded."""
+    """Set the environment variables of `thread_limits` for `workers` processes within the block.
+    Libraries in the child processes read them when they are loaded."""
     limits = thread_limits(workers)
     before = {name: os.environ.get(name) for name in limits}
     os.environ.update(limits)

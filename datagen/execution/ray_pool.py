@@ -118,7 +118,7 @@ class RayPool:
         process was already connected."""
         if self._ray.is_initialized():
             return False
-        # Only the named cluster: one found by chance may belong to another collection.
+        # Never search for a cluster: a cluster found by chance may belong to another collection.
         address = os.environ.get("RAY_ADDRESS", "local")
         cores = {"num_cpus": max(self._size, cpu_count() or 1)} if address == "local" else {}
         try:
@@ -206,8 +206,8 @@ class RayPool:
 
 
 def _received(job: Job, ending: Outcome, data: bytes) -> Outcome:
-    """Move the bytes of a finished round into the dataset folder; return the outcome, AttemptFailed
-    if the bytes were damaged in transfer."""
+    """Move `data`, the bytes of a finished round, into the dataset folder. Return the outcome
+    `ending`, or AttemptFailed if the bytes were damaged in transfer."""
     if not isinstance(ending, RoundDone):
         return ending
     if hashlib.sha256(data).hexdigest() != ending.state.sha256:

@@ -19,8 +19,8 @@ class Timeouts:
     """Time limits and delays of an executor, in s."""
 
     heartbeat_s: float = 300.0
-    """A process that sends no message for this time counts as hanging and is stopped. It sends no
-    messages while it compiles."""
+    """A process that has sent no message for this time (s) counts as hanging and is stopped. The
+    time is long, because a process sends no messages while it compiles its functions."""
     round_start_s: float = 600.0
     frame_s: float = 1.0
     """A round may take `round_start_s` plus this time for each frame."""
@@ -28,17 +28,18 @@ class Timeouts:
     """Delay before the second attempt. The delay before the third attempt is four times as long."""
 
     def deadline(self, job: Job | None, started: float, last_heartbeat: float) -> float:
-        """Return the time (s) at which a process is stopped that records `job` since `started`, and
-        whose last message arrived at `last_heartbeat`; infinite without a job. All times are
-        monotonic."""
+        """Return the time (s) at which a process that records `job` is stopped; infinite if `job`
+        is None. The process began the job at `started` and sent its last message at
+        `last_heartbeat`. All times are monotonic, in s."""
         if job is None:
             return float("inf")
         round_s = self.round_start_s + self.frame_s * job.plan.frames
         return min(last_heartbeat + self.heartbeat_s, started + round_s)
 
     def spent(self, now: float, started: float, last_heartbeat: float) -> str:
-        """Return in words which time limit a process has exceeded. The times are monotonic, in
-        s."""
+        """Return text that states which time limit a process has exceeded at the time `now`.
+        `started` is the start of its job, `last_heartbeat` the arrival of its last message. All
+        times are monotonic, in s."""
         silent_s = now - last_heartbeat
         if silent_s >= self.heartbeat_s:
             return f"gave no sign of life for {silent_s:.0f} s"
@@ -96,7 +97,8 @@ class RetryQueue:
         self._on_message(outcome)
 
     def record_death(self, job: Job | None, reason: str) -> None:
-        """Count a recording process that ended unexpectedly and queue its round again.
+        """Count a recording process that ended unexpectedly, and queue its round `job` again.
+        `reason` describes the end of the process, for messages.
 
         Raises DatasetError when 12 processes (DEATHS_IN_A_ROW) have ended without a finished round
         in between.
@@ -111,8 +113,9 @@ class RetryQueue:
             self.record_failure(job, reason, monotonic())
 
     def record_failure(self, job: Job, reason: str, now: float, final: bool = False) -> None:
-        """Queue the round for another attempt after a delay, or add it to `failures` if it was the
-        third attempt (ATTEMPTS) or `final` is true. `now` is in s."""
+        """Queue the round of `job` for another attempt after a delay. Instead, add it to `failures`
+        with `reason` if this was the third attempt (ATTEMPTS) or `final` is true. `now` is the
+        monotonic time in s."""
         self._on_message(FramesDone(job.plan.id, 0))
         attempts = self._attempts[job.plan.id] = self._attempts.get(job.plan.id, 0) + 1
         if attempts < ATTEMPTS and not final:

@@ -32,8 +32,9 @@ INDEX_NAME = "__index_level_0__"
 
 
 def write(folder: Path, parts: list[Side], camera: CameraParameters, progress: Progress) -> None:
-    """Write all rounds of `parts` into `folder`, and call `progress` with the number of frames
-    written so far. Raises DatasetError if rounds have different frame rates."""
+    """Write all rounds of the sides `parts` into `folder`. `camera` gives the size of the images.
+    `progress` is called with the number of frames written so far. Raises DatasetError if rounds
+    have different frame rates."""
     rounds = [info for side in parts for info in side.rounds]
     tasks = sorted({_task(info) for info in rounds})
     with _DataFiles(folder) as files:
@@ -88,7 +89,8 @@ class _DataFiles:
 
 
 class _Episodes:
-    """Writes rounds one at a time; collects the rows of meta/episodes and the statistics."""
+    """Writes rounds one at a time, and collects the rows of meta/episodes and the statistics of the
+    dataset."""
 
     def __init__(self, files: _DataFiles, camera: CameraParameters, tasks: list[str]) -> None:
         self.rows: list[dict[str, Any]] = []

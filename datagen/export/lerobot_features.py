@@ -55,10 +55,12 @@ def features(camera: CameraParameters) -> dict[str, Any]:
 
 
 def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int) -> Columns:
-    """Return the columns of an episode by name, one row per frame, without the images.
+    """Return the columns of an episode by name, one row for each of its frames `steps`, without the
+    images.
 
-    `first` is the index of the episode's first frame in the dataset. `task` is the index of its
-    task (the trajectory) in meta/tasks.parquet. Timestamps (s) are computed from `fps`.
+    `fps` is the number of frames per second, from which the timestamps (s) are computed. `episode`
+    is the index of the episode, and `first` the index of the episode's first frame in the dataset.
+    `task` is the index of its task (the trajectory) in meta/tasks.parquet.
     """
     rows = [_row(step) for step in steps]
     found: Columns = {
@@ -74,14 +76,16 @@ def columns(steps: Sequence[Step], fps: int, episode: int, first: int, task: int
 
 
 def _row(step: Step) -> dict[str, Any]:
-    """The values of a frame by name; absent values are None, which becomes NaN."""
+    """Return the values of the frame `step` by name. Absent values are None; `columns` stores them
+    as NaN."""
     row = values(step.labels) | values(step.ego) | values(step.command)
     return row | {"heading": step.labels.heading}
 
 
 def table(steps: Sequence[Step], numbers: Columns, codec: str) -> pa.Table:
-    """Return the rows of an episode as a table for the files in data/: the columns `numbers` and
-    the encoded images. `codec` ("jpeg" or "png") sets the suffix of the image names."""
+    """Return the rows of an episode as a table for the files in data/: the columns `numbers`, and
+    the encoded images of the frames `steps`. `codec` ("jpeg" or "png") sets the suffix of the image
+    names."""
     images = pa.StructArray.from_arrays(
         [
             pa.array([bytes(step.image) for step in steps], pa.binary()),

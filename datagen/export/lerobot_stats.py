@@ -49,8 +49,8 @@ def _stats_of_values(values: NDArray[np.float64]) -> dict[str, float]:
 
 
 class Histogram:
-    """`counts` (3, 256): the number of pixels of each level in each colour channel, over `images`
-    images."""
+    """Histograms of the pixels of `images` images: `counts` (3, 256) is the number of pixels of
+    each level (0 to 255) in each colour channel."""
 
     def __init__(self) -> None:
         self.images = 0

@@ -1,7 +1,7 @@
 """Writes the output folder of an export atomically.
 
 The folder is written as `.NAME.partial` beside the target and renamed when it is complete. So a
-killed export leaves no folder that looks complete; the next export deletes what it left.
+killed export leaves no folder that looks complete. The next export deletes the partial folder.
 """
 
 import os
@@ -47,8 +47,8 @@ def require_free(target: Path) -> None:
 
 
 def _lock(descriptor: int, partial: Path, target: Path) -> None:
-    """Lock the folder until `descriptor` is closed. Raises UserError if another export uses or has
-    renamed it."""
+    """Lock the folder `partial` until its `descriptor` is closed. Raises UserError, which names
+    `target`, if another export uses `partial` or has renamed it to `target`."""
     is_ours = try_lock(descriptor) and partial.exists()
     if not is_ours or partial.stat().st_ino != os.fstat(descriptor).st_ino:
         raise UserError(f"another `datagen export` is writing to {target}; give another --out")

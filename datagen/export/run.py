@@ -94,8 +94,9 @@ def _write(
 
 
 def _card(dataset: Dataset, parts: list[Side], kind: str, shard_size: int) -> str:
-    """Text of the export's README.md (Markdown with front matter for Hugging Face), made from the
-    template `webdataset.md` or `lerobot.md`."""
+    """Return the text of the export's README.md: Markdown with front matter for Hugging Face, made
+    from the template `webdataset.md` or `lerobot.md`. `parts` are the exported sides, `kind` is the
+    format, and `shard_size` the number of frames per WebDataset shard."""
     counts = ", ".join(
         f"{side.name} {counted(side.frames, 'frame')} of {counted(len(side.rounds), 'round')}"
         for side in parts

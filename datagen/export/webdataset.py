@@ -28,7 +28,7 @@ SHUFFLE_SEED = 0
 def write(
     folder: Path, parts: list[Side], shard_size: int, shuffle: bool, progress: Progress
 ) -> None:
-    """Write the shards of all sides, `shard_size` frames each, into `folder`.
+    """Write the shards of the sides `parts`, `shard_size` frames each, into `folder`.
 
     With `shuffle` the frames of a side are in a fixed random order. `progress` is called with the
     number of frames written so far.

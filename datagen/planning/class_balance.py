@@ -35,8 +35,9 @@ TARGET_SHARE = 0.19
 START_CANDIDATES = 48
 """Number of starts tried for each round, evenly spaced around the lap."""
 MIN_GAIN = 1e-4
-"""A start is changed only if the shares missing to `TARGET_SHARE` then fall by at least this number
-divided by the number of rounds."""
+"""A start is changed only if the change reduces the amount that the classes lack to `TARGET_SHARE`
+by at least this number divided by the number of rounds. The amount is the sum over the three
+classes."""
 
 
 class Forecast(Protocol):
@@ -101,8 +102,9 @@ class TrackForecast:
 
 
 def expected_speed(entry: RoundPlan) -> float:
-    """Return the expected speed (m/s) of a round's car on a straight. On a one-lane road nobody can
-    overtake, so it is at most the expected speed of the slowest other car."""
+    """Return the expected speed (m/s) of the car of the round `entry` on a straight. Nobody can
+    overtake on a one-lane road, so there the result is at most the expected speed of the slowest
+    other car."""
     speed = entry.speed_kmh
     if entry.lanes == 1 and entry.traffic:
         low, high = DESIRED_KMH
@@ -129,8 +131,9 @@ def expected_shares(rounds: Sequence[RoundPlan], forecast: Forecast) -> FloatArr
 
 
 def _better_starts(rounds: Sequence[RoundPlan], forecast: Forecast) -> dict[int, float]:
-    """Choose new starts, and return them by index in `rounds`. Each iteration makes the change with
-    the greatest gain, until all classes reach `TARGET_SHARE` or no change helps."""
+    """Choose new starts with `forecast`, and return them by index in `rounds`. Each iteration makes
+    the change with the greatest gain, until all classes reach `TARGET_SHARE` or no change gains
+    more than `MIN_GAIN` requires."""
     shares = np.array([forecast(entry, np.array([entry.start]))[0] for entry in rounds])
     steps = np.arange(START_CANDIDATES) / START_CANDIDATES
     starts = [(entry.start + steps) % 1.0 for entry in rounds]

@@ -124,7 +124,8 @@ def _cameras(config: CollectConfig, rng: np.random.Generator) -> list[CameraPara
 def _roads(
     config: CollectConfig, lanes: Sequence[int], lights: Sequence[tuple[str, ...]]
 ) -> list[VariedRound | None]:
-    """Random values of the road of each round, from the round's seed; None on the paper's roads."""
+    """Return the random values of the road of each round, from the round's seed, its number of
+    lanes (`lanes`) and the lights of its scenes (`lights`). They are None on the paper's roads."""
     if config.roads == "paper":
         return [None] * config.rounds
     first, height_m = _first_seed(config), config.camera.height_above_road_m
@@ -135,7 +136,8 @@ def _roads(
 
 
 def _mounted(camera: CameraParameters, road: VariedRound | None) -> CameraParameters:
-    """The camera at the random height of a varied road; unchanged on the paper's roads."""
+    """Return `camera` at the random height of the varied road `road`. If `road` is None (the
+    paper's roads), return `camera` unchanged."""
     if road is None:
         return camera
     height = road.carriageway.camera_height_m

@@ -60,8 +60,8 @@ def protocol_plan(config: ProtocolConfig, tracks_dir: Path | None) -> Plan:
 
 
 def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) -> RoundPlan:
-    """Entry of a drive of `frames` frames from the start line. Values that the drives share with
-    other rounds are taken from the round `like`."""
+    """Return the entry of a drive of `frames` frames from the start line. Values that all drives
+    and rounds of the plan share are taken from the round `like`."""
     return replace(
         like,
         id=f"drive-{track.name}-{light}",

@@ -17,7 +17,8 @@ def choose_test_rounds(
     attributes: Sequence[Sequence[Hashable]],
     rng: np.random.Generator,
 ) -> set[int]:
-    """Choose the test rounds, about `test_share` (0 to below 1) of all; return their numbers.
+    """Choose the test rounds, about `test_share` (0 to below 1) of all rounds; return their
+    indices.
 
     `tracks`, `lanes` and each sequence in `attributes` have one value for each round. The test
     rounds are spread evenly over the tracks first, then over lane counts and `attributes`. A random
@@ -25,8 +26,8 @@ def choose_test_rounds(
 
     Every track with at least three rounds is on both sides, even if this takes more test rounds
     than `test_share`. The last training round of a track is chosen only if no other track has two
-    training rounds left. The same applies to roads (a road is a track with one lane count): tests
-    on roads without training rounds are the purpose of the side `unseen`.
+    training rounds left. The same rule applies to roads (a road is a track with one lane count).
+    The reason is that tests on roads without training rounds belong to the side `unseen`.
     """
     count = len(tracks)
     if test_share == 0.0 or count < 2:
@@ -40,10 +41,12 @@ def choose_test_rounds(
     in_training = np.ones(count, bool)
     chosen: set[int] = set()
     for _ in range(_number_of_test_rounds(test_share, tracks)):
-        # Only rounds of the best roads can be chosen. Roads are compared first: there are few.
+        # Only rounds of the best roads can be chosen. There are fewer roads than rounds, so it is
+        # faster to compare the roads first.
         best_roads = _best_roads(road, track, track_of_road)
         open_rounds = np.flatnonzero(in_training & best_roads[road.of])
-        # Summed from left to right: another order could round differently and choose other rounds.
+        # The shares are added from left to right. Another order could round differently, and then
+        # other rounds would be chosen.
         shares = sum(group.tested_share()[group.of[open_rounds]] for group in others)
         ties = open_rounds[shares == np.min(shares)]
         number = int(ties[np.argmin(draw[ties])])
@@ -59,7 +62,8 @@ class _Groups:
 
     def __init__(self, values: Sequence[Hashable]) -> None:
         numbers = {value: number for number, value in enumerate(dict.fromkeys(values))}
-        self.of: IntArray = np.array([numbers[value] for value in values])  # each round's group
+        # Index of the group of each round.
+        self.of: IntArray = np.array([numbers[value] for value in values])
         self.size: IntArray = np.bincount(self.of)
         self.tested: IntArray = np.zeros_like(self.size)
 
@@ -71,8 +75,9 @@ class _Groups:
 
 
 def _best_roads(road: _Groups, track: _Groups, track_of_road: IntArray) -> NDArray[np.bool_]:
-    """Mask (roads,) of the roads from which the next test round can be taken; they are equally
-    good."""
+    """Return a mask (roads,) of the roads from which the next test round can be taken. These roads
+    have the lowest penalty and, among the roads with this penalty, the track with the lowest share
+    of test rounds. `track_of_road` (roads,) is the index of each road's track."""
     left = road.in_training()
     last_of_track = (track.in_training() == 1)[track_of_road]
     penalty = 2 * last_of_track + (left == 1) + 4 * (left == 0)

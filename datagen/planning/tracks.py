@@ -39,7 +39,7 @@ def _choice(name: str, tracks_dir: Path | None) -> TrackChoice:
 
 
 def _trained_on(file: Path) -> bool:
-    """Whether a plan without names of tracks uses the track in `file`. It does not use a user's own
-    tracks."""
+    """Return whether a plan without names of tracks uses the track in `file`. Such a plan does not
+    use a user's own tracks."""
     ours = file.parent == OWN_TRACKS
     return file.stem not in HELD_OUT and (ours or file.suffix.lower() == ".xml")

@@ -37,7 +37,8 @@ PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A round to record: its plan entry, the dataset folder and a further folder of tracks."""
+    """A round to record: its plan entry, the dataset folder, and a further folder in which tracks
+    are searched."""
 
     plan: RoundPlan
     plan_hash: str
@@ -58,8 +59,8 @@ class FramesDone:
 
 @dataclass(frozen=True, slots=True)
 class RoundDone:
-    """Outcome: the round is in the dataset folder. The car was reset onto the road `resets` times
-    in it."""
+    """Outcome: the round is in the dataset folder. `resets` is the number of times that the car was
+    reset onto the road in this round."""
 
     state: RoundState
     resets: int
@@ -67,8 +68,8 @@ class RoundDone:
 
 @dataclass(frozen=True, slots=True)
 class AttemptFailed:
-    """Outcome: the attempt to record this round failed. Another attempt may succeed, unless
-    `final`."""
+    """Outcome: the attempt to record this round failed. Another attempt may succeed, unless `final`
+    is true."""
 
     round_id: str
     reason: str
@@ -126,8 +127,8 @@ def record_and_publish(job: Job, report: Report = lambda message: None) -> Round
 
 
 def _check_recorded(partial: Path) -> tuple[RoundState, int]:
-    """Read the recorded file; return its state and the number of resets. Raises RuntimeError if it
-    is damaged."""
+    """Read the recorded file `partial`; return the state of its round and the number of resets in
+    the round. Raises RuntimeError if the file is damaged."""
     index = open_round(partial)
     state = RoundState.of(partial, index.header, index.result)
     _, problems = check_round(partial, "full", state)
@@ -137,7 +138,8 @@ def _check_recorded(partial: Path) -> tuple[RoundState, int]:
 
 
 def _portable(error: UserError | OSError, folder: Path) -> UserError | OSError:
-    """The same error in a form that can be pickled. An OSError without a path gets `folder`."""
+    """Return the same error in a form that can be pickled. An OSError without a path gets the path
+    `folder`."""
     if isinstance(error, OSError):
         where = error.filename or str(folder)
         return OSError(error.errno or 0, error.strerror or str(error), where)

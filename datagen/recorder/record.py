@@ -37,12 +37,16 @@ NO_IMAGE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 EGO_NAMES = ("x", "y", "z", "yaw", "pitch", "roll", "vx", "vy", "yaw_rate")
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NOT_RECORDED = ("range_traffic",)
-MAX_RESETS = 20  # times control steps per frame, because rounds at a low frame rate are longer
-# Frames are simulated, rendered and written in batches: the driver needs no image, and simulation
-# is twice as fast without rendering in between.
+# Largest number of resets of a round with one control step per frame. The limit is proportional to
+# the control steps per frame, because rounds at a low frame rate last longer.
+MAX_RESETS = 20
+# Frames are simulated, rendered and written in batches. This is possible because the driver needs
+# no image, and simulation is twice as fast without rendering in between.
 BATCH_FRAMES = 20
-CACHED_SCENES = BATCH_FRAMES  # scenes kept by the camera: none is built twice in a batch
-SCENERY_SEED_STRIDE = 2**40  # between the seeds of a round's sceneries; larger than a round seed
+CACHED_SCENES = BATCH_FRAMES  # scenes that the camera keeps, so that a batch builds no scene twice
+# Difference between the seeds of two consecutive scenes of a round. It is larger than any seed of
+# a round, so scenes of different rounds never share a seed.
+SCENERY_SEED_STRIDE = 2**40
 
 
 Scenery = tuple[int, Light, RoadLook | None]
@@ -108,7 +112,7 @@ class RoundSimulation:
 
     def _start(self, s: float, to_middle: float) -> None:
         self.state = self.world.reset(
-            seed=self.plan.seed,  # never another round's, which may be on the other split side
+            seed=self.plan.seed,  # not a seed of another round, which may be on another side
             s=s,
             to_middle=to_middle,
             speed=self.driver.speed_at(s),
@@ -172,8 +176,8 @@ def simulate(simulation: RoundSimulation, camera: Camera) -> Iterator[list[Frame
 
 
 def scenery(plan: RoundPlan, number: int) -> Scenery:
-    """Return the seed, the light and the look of the road (None: the paper's) of scene `number`
-    (from 0) of a round. Each scene has its own seed."""
+    """Return the seed, the light and the look of the road of scene `number` (from 0) of a round.
+    The look is None on the paper's roads. Each scene has its own seed."""
     light = Light.named(plan.lights[number], np.random.default_rng([plan.seed, 2, number]))
     look = plan.varied.scenes[number] if plan.varied else None
     return plan.seed + number * SCENERY_SEED_STRIDE, light, look
@@ -232,7 +236,8 @@ def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
 def _next_frame(
     simulation: RoundSimulation, camera: Camera, suite: SensorSuite, number: int
 ) -> FrameTruth:
-    """Return frame `number` without its image, and advance the simulation to the next frame."""
+    """Return frame `number` without its image, and advance the simulation to the next frame.
+    `suite` reads the sensors."""
     scene = simulation.scenery_at(number)
     camera.change_scene(*scene)
     world, now = simulation.world, simulation.state

@@ -36,8 +36,9 @@ def replay(
     and a line for each difference from the files. `on_replayed` is called with the id of each
     round.
 
-    Labels and states must be equal in every byte. With `pixels` images must be equal too; only the
-    same renderer reproduces them. Raises UserError if a round cannot be simulated on this machine.
+    Labels and states must equal the recorded ones in every byte. With `pixels` the images must be
+    equal too, which requires the renderer that drew the recorded images. Raises UserError if a
+    round cannot be simulated on this machine.
     """
     if count < 1:
         raise tf.UserError(f"--replay is {count}; give the number of rounds to simulate again")
@@ -53,7 +54,7 @@ def differences(
     entry: RoundPlan, path: Path, tracks_dir: Path | None, pixels: bool
 ) -> Iterator[str]:
     """Yield a line for each topic in which the recorded round at `path` differs from a new
-    simulation of its plan entry."""
+    simulation of its plan entry. Images are compared only if `pixels` is true."""
     index = open_round(path)
     recorded = {topic: index.messages[topic] for topic in (topics.LABELS, topics.EGO_STATE)}
     first: dict[str, int] = {}

@@ -256,8 +256,8 @@ def _validate_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:
-    """The camera of the dataset: the camera of all rounds, without its jitter. Raises DatasetError
-    if the rounds have different cameras."""
+    """Return the camera of the dataset, that is, the camera of all its rounds without jitter.
+    `indexes` are the opened rounds. Raises DatasetError if the rounds have different cameras."""
     camera = indexes[0].header.dataset_camera
     for index in indexes:
         if index.header.dataset_camera != camera:

@@ -1,7 +1,8 @@
 """The files of a dataset folder, and how a finished round is moved into it.
 
 A round is written under `.partial/`, read back, checked, hashed, synced and renamed into `rounds/`;
-`state/ID.json` then holds its hashes. `manifest.py` derives all other files from these.
+`state/ID.json` then holds its hashes. `manifest.py` derives all other files of the folder from the
+files in `rounds/` and `state/`.
 """
 
 import json
@@ -20,7 +21,7 @@ from trackfeatures.names import require_name
 
 PARTIAL = ".partial"
 LOCKS = ".locks"
-MERGING = ".merging"  # exists from the first round of a merge to the last
+MERGING = ".merging"  # file that exists while a merge copies rounds
 SUBFOLDERS = ("rounds", "state", "splits", "layouts", "proto", "schemas")
 PUBLISHED_FILES = ("proto/driverview.proto", "layouts/foxglove.json", SCHEMA_FILE)
 
@@ -40,8 +41,8 @@ class RoundState:
 
     @staticmethod
     def of(path: Path, header: RoundHeader, result: RoundResult) -> "RoundState":
-        """Compute the state of the complete round file at `path`; it can still be outside
-        `rounds/`."""
+        """Compute the state of the complete round file at `path` from the file, its `header` and
+        its `result`. The file can still be outside `rounds/`."""
         return RoundState(
             id=header.id,
             file=f"rounds/{header.id}.mcap",
@@ -76,8 +77,8 @@ def prepare(folder: Path) -> None:
 
 
 def is_unstarted(folder: Path, first_file: str) -> bool:
-    """Whether `folder` holds nothing but empty subfolders of a dataset, locks and an unfinished
-    copy of `first_file`, the file that a collection writes first.
+    """Return whether `folder` holds nothing but empty subfolders of a dataset, locks and an
+    unfinished copy of `first_file`, the file that a collection writes first.
 
     A collection leaves a folder in this state if the disk is full from the start.
     """
@@ -139,8 +140,8 @@ def partial_path(folder: Path, round_id: str) -> Path:
 
 
 def publish(folder: Path, partial: Path, state: RoundState) -> None:
-    """Move a checked round into `rounds/`, then write its state. After a power cut in between, the
-    round has no state and counts as unfinished."""
+    """Move the checked round file `partial` into `rounds/`, then write its state. After a power cut
+    in between, the round has no state and counts as unfinished."""
     atomic_move(partial, round_path(folder, state.id))
     write_state(folder, state)
     discard_partial(folder, state.id)

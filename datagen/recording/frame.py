@@ -68,10 +68,9 @@ class RoadPlace:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A recorded frame. `image` is (H, W, 3) uint8 RGB; `traffic` (n, 6) is x, y, z (m), roll,
-    pitch, yaw (rad) of the n other cars; `markings` are the visible lane markings as polylines
-    (k, 2) in pixels.
-    """
+    """A recorded frame. `image` is (H, W, 3) uint8 RGB. `traffic` (n, 6) is x, y, z (m), roll,
+    pitch, yaw (rad) of each of the n other cars. `markings` are the visible lane markings as
+    polylines (k, 2) in pixels."""
 
     image: NDArray[np.uint8]
     features: tf.TrackFeatures

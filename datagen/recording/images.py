@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 JPEG_QUALITY = 95
 JPEG_MAGIC = b"\xff\xd8"
 PNG_MAGIC = b"\x89PNG"
-PNG_SIZE_AT, PNG_SIZE = 16, Struct(">II")  # width and height in IHDR
+# Byte offset and layout of width and height in the header of a PNG file.
+PNG_SIZE_AT, PNG_SIZE = 16, Struct(">II")
 
 Buffer = bytes | memoryview
 

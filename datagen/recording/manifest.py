@@ -1,7 +1,7 @@
 """Writes the derived files of a dataset folder: manifest, split, statistics and dataset card.
 
 `manifest.json` lists the rounds with their metadata and hashes, and the hashes of other files.
-Verification computes it again from the rounds, and so finds damage in it.
+Verification computes the manifest again from the rounds, and so finds damage in it.
 """
 
 import json
@@ -25,7 +25,7 @@ from runtime.files import file_hash
 from trackfeatures.camera import stored
 
 MANIFEST = "manifest.json"
-# Not the dataset card: people edit it.
+# The dataset card is not hashed, because people edit it.
 HASHED_FILES = (*PUBLISHED_FILES, "plan.json", "stats.json")
 
 

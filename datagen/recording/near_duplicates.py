@@ -31,8 +31,9 @@ class Tolerances:
 class NearPair:
     """A frame and the nearest frame of the other side of the split.
 
-    `distance` is the largest of the differences, each divided by its tolerance: 0 means the same
-    pose, 1 the limit. `s_m` is the position of the first frame on the lap.
+    `distance` is the largest of the differences in position, offset and angle, each divided by its
+    tolerance: 0 means the same pose, 1 the limit. `s_m` is the position (m) of frame `frame` of
+    round `round` on the lap.
     """
 
     distance: float
@@ -46,8 +47,9 @@ class NearPair:
 
 @dataclass(frozen=True, slots=True)
 class NearDuplicates:
-    """Numbers of frames of one side: all `frames`, and those (`near`) with a near-duplicate on the
-    other side. `worst`: the nearest pairs, at most 10 (MAX_LISTED), the nearest first."""
+    """Numbers of frames of one side: `frames` is the number of all frames, and `near` the number of
+    frames with a near-duplicate on the other side. `worst` are the nearest pairs, at most 10
+    (MAX_LISTED), the nearest first."""
 
     frames: int
     near: int
@@ -64,8 +66,9 @@ def find_near_duplicates(
     other: NDArray[np.bool_],
     tolerances: Tolerances,
 ) -> NearDuplicates:
-    """Find near-duplicates of the frames in mask `side` (N,) among those in mask `other` (N,),
-    where N is the number of frames in `labels`, the labels of `rounds`.
+    """Find near-duplicates of the frames in mask `side` (N,) among the frames in mask `other` (N,),
+    where N is the number of frames in `labels`, the labels of `rounds`. `tolerances` are the
+    largest differences between near-duplicates.
 
     Pairs across the start line are not found, because `s` jumps there from the lap's length to 0.
     """
@@ -87,9 +90,9 @@ def find_near_duplicates(
 def _scaled_poses(
     labels: Labels, rounds: Sequence[RoundInfo], tolerances: Tolerances
 ) -> NDArray[np.float64]:
-    """Poses (N, 4): s, lateral offset and angle, each in units of its tolerance, and 10 times the
-    number of the frame's combination of track, lanes and light, so that frames of two combinations
-    are far apart."""
+    """Return poses (N, 4) for a nearest-neighbour search: s, lateral offset and angle, each in
+    units of its tolerance, and 10 times the number of the frame's combination of track, lanes and
+    light. The fourth column separates frames of different combinations."""
     numbers: dict[tuple[str, int], int] = {}
     of_round = [numbers.setdefault((r.track, r.lanes), len(numbers)) for r in rounds]
     kinds, light = np.unique(labels.light, return_inverse=True)

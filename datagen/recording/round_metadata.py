@@ -40,7 +40,8 @@ class RoundHeader:
     traffic: int
     trajectory: str
     lights: tuple[str, ...]
-    """Names of the lights of successive stretches; after the last one they start again."""
+    """Names of the lights. Each stretch of `stretch` frames has the next light; after the last
+    light the first one follows again."""
     speed_kmh: float
     stretch: int = 0
     """Number of frames in a row with the same scenery and light; 0: the whole round."""
@@ -65,9 +66,9 @@ class RoundHeader:
     def label_camera(self) -> CameraParameters:
         """The camera that training assumes for the round's images.
 
-        A round on a varied road has its own camera height: this is `camera`, and training scales
-        the labels from it to the dataset's camera. With camera jitter this is the dataset's camera;
-        training ignores the jitter.
+        On a varied road, this is `camera`, because every round has its own camera height; training
+        scales the labels from this height to the height of the dataset's camera. On the paper's
+        roads, this is the dataset's camera; training ignores camera jitter.
         """
         return self.camera if self.varied is not None else self.dataset_camera
 
@@ -104,7 +105,7 @@ class RoundHeader:
 
     def to_metadata(self) -> dict[str, str]:
         values = asdict(self, dict_factory=stored)
-        if self.varied is None:  # keeps the bytes of rounds on the paper's roads as they were
+        if self.varied is None:  # rounds on the paper's roads have the bytes of earlier versions
             del values["varied"]
         return {name: json.dumps(value) for name, value in values.items()}
 
@@ -124,7 +125,7 @@ class RoundHeader:
 @dataclass(frozen=True, slots=True)
 class RoundResult:
     """The record `driverview.result`: totals of a finished round. `content_hash` is the SHA-256 of
-    its images and labels."""
+    the images and labels of the round."""
 
     frames: int
     content_hash: str
@@ -143,10 +144,11 @@ class RoundResult:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """The record `driverview.recovered`: the round has only the undamaged frames of `source`.
+    """The record `driverview.recovered`: the round has only the undamaged frames of the file
+    `source`.
 
-    `saved` frames are in the round and `lost` frames are missing. With `at_least`, more can be
-    missing, because the original number is unknown.
+    `saved` frames are in the round and `lost` frames are missing. If `at_least` is true, more
+    frames can be missing, because the original number of frames is unknown.
     """
 
     source: str

@@ -37,8 +37,9 @@ class SplitConfig:
 
 @dataclass(frozen=True, slots=True)
 class SplitReport:
-    """A valid split: numbers of rounds and frames by side, and for each side except train its
-    frames with a near-duplicate in train. `made`: this command created the split."""
+    """A valid split: numbers of rounds and frames by side and, for each side except train, the
+    numbers of frames with a near-duplicate in train. `made` is true if this command created the
+    split."""
 
     path: Path
     made: bool
@@ -88,7 +89,8 @@ def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
 
 
 def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:
-    """Check a split and return its report; `made` (this command created the split) is stored in it.
+    """Check a split and return its report. `tolerances` are the largest differences between
+    near-duplicates. `made` states whether this command created the split; the report contains it.
     Raises DatasetError if a round, seed or content hash is on two sides."""
     dataset = Dataset.open(folder, name)
     frames = dataset.select("all")

@@ -27,7 +27,7 @@ DEFAULT_SPLIT = "default"
 
 @dataclass(frozen=True, slots=True)
 class RoundKey:
-    """Identity of a round: two rounds that share one of the values must be on the same side."""
+    """Identity of a round. Two rounds that share one of these values must be on the same side."""
 
     id: str
     seed: int
@@ -142,7 +142,7 @@ def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: 
     else:
         order = _order_by_track(groups, rng)
     # Group n is a test group if round(n * test_share) < round((n + 1) * test_share).
-    # Rounding to the nearest treats both ends of the order alike.
+    # With rounding to the nearest integer, the first and the last group have equal chances.
     marks = [floor((n * test_share) + 0.5) for n in range(len(order) + 1)]
     chosen = [group for n, group in enumerate(order) if marks[n + 1] > marks[n]]
     if not chosen and len(order) > 1:
@@ -160,8 +160,8 @@ def split_rounds(rounds: Sequence[RoundInfo], by: str, test_share: float, seed: 
 def _order_by_track(
     groups: list[list[RoundInfo]], rng: np.random.Generator
 ) -> list[list[RoundInfo]]:
-    """The groups sorted by track, in random order within a track. Groups picked at even distances
-    from this list cover all tracks."""
+    """Return the groups sorted by track, in random order within a track. Groups selected at equal
+    distances in this list cover all tracks."""
     tracks: dict[str, list[list[RoundInfo]]] = defaultdict(list)
     for i in rng.permutation(len(groups)):
         tracks[groups[i][0].track].append(groups[i])
@@ -169,7 +169,8 @@ def _order_by_track(
 
 
 def _inseparable_groups(rounds: Sequence[RoundInfo], by: str) -> list[list[RoundInfo]]:
-    """Groups of rounds that must be on the same side, sorted by the id of their first round."""
+    """Return the groups of rounds that must be on the same side, sorted by the id of their first
+    round. Rounds of a group share a seed, a content hash or, if `by` is "track", a track."""
     groups: list[list[RoundInfo]] = []
     keys: list[set[object]] = []
     for info in rounds:

@@ -21,7 +21,7 @@ from runtime.cli import counted
 Image = NDArray[np.uint8]
 
 SCALE = 2
-"""Factor by which frames are enlarged, so that thin lines stay thin."""
+"""Factor by which frames are enlarged, so that the drawn lines cover little of a frame."""
 _GREEN = (40, 255, 80)
 
 

@@ -21,9 +21,10 @@ BALANCED_BY = ("track", "lanes", "trajectory", "traffic")
 MIN_CLASS_SHARE = 0.15
 MIN_ACTIVE_SHARE = 0.02
 SHARED_BY_SPLITS = ("track", "lanes", "light", "trajectory")
-"""Properties of a round. Each of their values should occur in both splits, train and test."""
+"""Properties of a round. Each of their values should occur on both sides, train and test."""
 REQUIRED_SPLITS = ("train", "test")
-"""Splits that every dataset needs. `unseen` is collected on request and has other tracks."""
+"""Sides of the split that every dataset needs. The side `unseen` is recorded only on request, on
+other tracks."""
 
 
 def page(dataset: Dataset) -> str:
@@ -127,7 +128,7 @@ def _rare_labels(statistics: dict[str, Any]) -> Iterator[str]:
 
 
 def _one_sided_properties(rounds: list[RoundInfo]) -> Iterator[str]:
-    """Yield a warning for each property with values that occur in only one of train and test."""
+    """Yield a warning for each property with values that occur only in train or only in test."""
     by_split = {s: [info for info in rounds if info.split == s] for s in REQUIRED_SPLITS}
     if not all(by_split.values()):
         return

@@ -33,8 +33,9 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot of series with the same unit. Its axis has the range `limits`; None: fitted to the
-    values. With `dots` the values are not joined by lines, because some can be absent."""
+    """A plot of series with the same unit. Its axis has the range `limits`; if `limits` is None,
+    the range fits the values. With `dots` the values are not joined by lines, because some values
+    can be absent."""
 
     title: str
     unit: str

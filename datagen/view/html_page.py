@@ -14,7 +14,8 @@ from datagen.view.contents import Contents, Plot, Points, Pose
 from runtime.html import data_uri, render
 
 MAX_FRAMES = 500
-"""Longer rounds are subsampled evenly, so that the page stays below about 15 MB."""
+"""Largest number of images on the page. Longer rounds are subsampled evenly, so that the page stays
+below about 15 MB."""
 
 
 def page(contents: Contents, max_frames: int = MAX_FRAMES) -> str:

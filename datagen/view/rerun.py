@@ -124,8 +124,8 @@ def plot_entity(plot: Plot) -> str:
 
 
 def _entity_name(title: str) -> str:
-    """`title` in lower case, with `_` for all characters but letters and digits: others have a
-    meaning in Rerun's entity paths."""
+    """Return `title` in lower case, with `_` for all characters except letters and digits. Other
+    characters have a meaning in Rerun's entity paths."""
     return re.sub("[^a-z0-9]+", "_", title.lower())
 
 

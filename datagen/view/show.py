@@ -92,8 +92,8 @@ def save(contents: Contents, path: Path) -> None:
 
 
 def _require_all_images(path: Path, frames: int) -> None:
-    """Raise ValueError unless the file has all images: Rerun writes in the background and does not
-    report a failed write."""
+    """Raise ValueError unless the Rerun file at `path` has all `frames` images. The check is needed
+    because Rerun writes in the background and does not report a failed write."""
     from rerun.chunk import RrdReader
 
     from datagen.view.rerun import IMAGE

@@ -18,15 +18,17 @@ from trackfeatures.measurement import LineOffsets
 TOLERANCE_M = 1e-4
 SHIFTS_M = (0.0, -TOLERANCE_M, TOLERANCE_M)
 MAX_HEIGHT_M = 1.0
-"""Largest height of the centre of gravity above the road plane, also in a jump. Distances are
-measured from the nearest point of the road plane (the foot), but `to_middle` is that of the centre
-of gravity itself. On a banked road the two differ by the height times the tangent of the banking;
-the car's roll angle is used for the banking."""
+"""Largest height (m) of the centre of gravity above the road plane, also in a jump. Distances are
+measured from the nearest point of the road plane (the foot), but `to_middle` is the lateral offset
+of the centre of gravity itself. On a banked road, the lateral offsets of the foot and of the centre
+of gravity differ by the height times the tangent of the banking. The car's roll angle is used as
+the banking."""
 FOOT_SLACK_M = 0.005
-"""Tolerance added to this difference, m."""
+"""Tolerance (m) added to the lateral distance between the foot and the centre of gravity."""
 
 _Lines = tuple[int, float, LineOffsets]
-"""Number of lanes, lane width (m), and two offsets (m) of the lines of each marking."""
+"""Number of lanes, lane width (m), and for each marking the offsets (m) of its leftmost and its
+rightmost line."""
 
 
 def label_problems(
@@ -39,8 +41,9 @@ def label_problems(
     """Yield a line for each kind of contradiction between a round's labels and the definitions.
 
     `roll` (N,) is the car's roll in rad. On a banked road it limits the lateral distance between
-    the centre of gravity and the nearest point of the road plane. `line_offsets` are the offsets
-    (m) of the painted lines of each marking from its nominal position; () for none.
+    the centre of gravity and the nearest point of the road plane. `lanes` is the round's number of
+    lanes, and `lane_width_m` their width (m). `line_offsets` are the offsets (m) of the painted
+    lines of each marking from its nominal position; () means that all offsets are 0.
     """
     try:
         tf.check_lanes(lanes, lane_width_m)
@@ -62,13 +65,13 @@ def label_problems(
 
 
 def _distances_follow(labels: Labels, i: int, reach_m: float, road: _Lines) -> bool:
-    """Whether all distances of frame `i` follow from one lateral position that differs from the
-    recorded offset by at most `reach_m`."""
+    """Return whether all distances of frame `i` follow from one lateral position on `road`. This
+    position may differ from the recorded offset by at most `reach_m` (m)."""
     offset, found = float(labels.to_middle[i]), labels.distances[i].astype(np.float64)
     if not np.isfinite(offset):
         return False
     gaps = found - _expected(offset, road)
-    if np.isnan(gaps).all():  # a limit of the two systems can lie between both positions
+    if np.isnan(gaps).all():  # the two positions can lie in different systems of distances
         feet = np.linspace(-reach_m, reach_m, 41)
     else:
         feet = np.array([0.0, np.nanmedian(gaps)])
@@ -80,7 +83,8 @@ def _distances_follow(labels: Labels, i: int, reach_m: float, road: _Lines) -> b
 
 
 def _expected(offset: float, road: _Lines) -> NDArray[np.float64]:
-    """The distances (5,) at an offset from the track's centre (m), NaN where absent."""
+    """Return the five distances (5,) in m at the lateral `offset` (m) from the centre of `road`;
+    NaN where a distance is absent."""
     values = tf.measure(offset, 0.0, 0.0, 0.0, *road).distances.values()
     return np.array([np.nan if d is None else d for d in values])
 
@@ -104,7 +108,8 @@ def _centre_follows(labels: Labels) -> NDArray[np.bool_]:
 def _close(
     expected: NDArray[np.float64], found: NDArray[np.floating[Any]], tolerance: float
 ) -> NDArray[np.bool_]:
-    """Mask: both are NaN, or both are present and differ by at most `tolerance`."""
+    """Return a mask of the elements of `expected` and `found` that are both NaN, or that are both
+    present and differ by at most `tolerance`."""
     absent = np.isnan(expected) & np.isnan(found)
     same: NDArray[np.bool_] = absent | (np.abs(expected - found) <= tolerance)
     return same

@@ -148,8 +148,9 @@ def _require_free(target: Path, round_id: str) -> None:
 
 
 def _recovery(file: Path, data: bytes, intact: IntactFrames) -> Recovery:
-    """Make the recovery record. The original number of frames is read from the result metadata, or
-    else from the state of the round."""
+    """Make the recovery record of the damaged `file` with the bytes `data` and the frames `intact`.
+    The original number of frames is read from the result metadata or, if they are damaged, from the
+    state of the round."""
     saved = len(intact.steps)
     recorded = _recorded_frames(data)
     if not recorded and file.parent.name == ROUNDS:
@@ -169,7 +170,8 @@ def _recorded_frames(data: bytes) -> int:
 
 
 def _write(path: Path, header: RoundHeader, intact: IntactFrames, recovery: Recovery) -> RoundState:
-    """Write the intact frames as a round file with their original log times; return its state."""
+    """Write the intact frames as a round file at `path`, with their original log times and the
+    metadata records `header` and `recovery`. Return the state of the new file."""
     content = hashlib.sha256()
     with RoundFile(path, header) as file:
         for topic, log_time, number, payload in _messages(header, intact):

@@ -99,11 +99,12 @@ def _full(index: RoundIndex, state: RoundState | None, checker: "_MessageChecker
 
 
 def _times(index: RoundIndex, found: Scan) -> Iterator[str]:
-    """Yield a problem if a topic of every frame lacks a message, a message has a wrong log time, or
-    the log times of any topic do not increase."""
+    """Yield a problem for each topic of EVERY_STEP without exactly one message per frame or with a
+    wrong log time, and for each topic whose log times do not increase. `index` is the opened round,
+    `found` the result of its scan."""
     frames, hertz = index.result.frames, index.header.frequency_hz
     clock = [topics.log_time_ns(step, hertz) for step in range(frames)]
-    if index.recovery is not None:  # with gaps: compare with the image times instead
+    if index.recovery is not None:  # frames are missing, so compare with the times of the images
         clock = found.times.get(topics.CAMERA, [])
     for topic in topics.EVERY_STEP:
         times = found.times.get(topic, [])

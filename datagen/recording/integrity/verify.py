@@ -47,7 +47,7 @@ def verify(
     """Check every round at `level` (quick, full or deep), the splits and the manifest.
 
     The rounds are checked on one thread per core. `on_round_done` is called with the id of each
-    checked round, on any of these threads. Raises DatasetError for another level.
+    checked round, on any of these threads. Raises DatasetError for an unknown level.
     """
     if level not in LEVELS:
         raise DatasetError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
@@ -61,7 +61,8 @@ def verify(
         on_round_done(file.stem)
         return done
 
-    # Threads: hashing, CRCs and decoding release the GIL, and are nearly all of the time.
+    # Threads suffice, because hashing, CRCs and decoding take nearly all of the time and release
+    # the GIL.
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         checked = list(pool.map(check, files))
     problems = [problem for _, found in checked for problem in found]

@@ -28,7 +28,8 @@ from datagen.recording.mcap.records import (
 
 @dataclass(frozen=True, slots=True)
 class ChunkIndex:
-    """File offset `start` of a chunk and file offsets of its message indexes, by channel."""
+    """Place of a chunk in an MCAP file. `start` is its file offset (bytes); `indexes` are the file
+    offsets of its message indexes, by channel."""
 
     start: int
     compression: str
@@ -105,6 +106,6 @@ def _chunk(view: memoryview, at: int) -> ChunkIndex:
     _, _, start, _, size = CHUNK_INDEX.unpack_from(view, at)
     at += CHUNK_INDEX.size
     indexes = dict(INDEX_OFFSET.iter_unpack(view[at : at + size]))
-    at += size + LONG_LENGTH.size  # the indexes' total length
+    at += size + LONG_LENGTH.size  # skips the field with the total length of the message indexes
     (length,) = LENGTH.unpack_from(view, at)
     return ChunkIndex(start, text(view, at)[0] if length else "", indexes)

@@ -29,8 +29,8 @@ MAX_DURATION_NS = 366 * 86_400 * topics.NANOSECONDS
 
 @dataclass(frozen=True, slots=True)
 class ChunkBytes:
-    """Bytes of the messages of a chunk. `intact`: the CRC is right; otherwise the chunk's end is
-    cut or overwritten."""
+    """Bytes of the messages of a chunk. If `intact` is true, the CRC is right. Otherwise the end of
+    the chunk is cut or overwritten."""
 
     data: memoryview
     intact: bool
@@ -38,7 +38,8 @@ class ChunkBytes:
 
 @dataclass(frozen=True, slots=True)
 class FoundMessage:
-    """A message found in a chunk. `step` (its sequence number) is its frame; `log_time` in ns."""
+    """A message found in a chunk. `step`, its sequence number, is the number of its frame;
+    `log_time` is in ns."""
 
     topic: str
     step: int
@@ -89,8 +90,8 @@ def find_metadata(data: bytes, name: str) -> dict[str, str] | None:
 
 
 def _chunk_size_and_crc(view: memoryview, at: int) -> tuple[int, int]:
-    """Size (bytes) and CRC of the messages of the uncompressed chunk at byte `at`, as its record
-    states them; size 0 if there is no such record."""
+    """Return the size (bytes) and the CRC of the messages of the uncompressed chunk at byte `at`,
+    as the chunk's record states them. The size is 0 if there is no chunk record at this place."""
     if at + CHUNK_HEAD > len(view):
         return 0, 0
     _, length = RECORD.unpack_from(view, at)
@@ -112,8 +113,8 @@ def _has_message_index(view: memoryview, at: int) -> bool:
 
 
 def _parse_messages(data: memoryview) -> tuple[list[FoundMessage], bool]:
-    """The complete messages at the start of `data`, and whether message records fill `data` to its
-    end (False: other bytes follow)."""
+    """Return the complete messages at the start of `data`, and whether message records fill `data`
+    to its end. False means that other bytes follow."""
     names = list(topics.MESSAGE_TYPES)  # channel numbers follow this order, from 1
     found: list[FoundMessage] = []
     at = 0

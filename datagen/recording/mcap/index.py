@@ -131,8 +131,8 @@ class MappedMessages:
 
     @cached_property
     def _table(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Log times (N,) in ns, file offsets (N,) and chunk numbers (N,) of the messages, from the
-        message index after each chunk."""
+        """Return the log times (N,) in ns, file offsets (N,) and chunk numbers (N,) of the
+        messages, from the message index that follows each chunk."""
         parts, starts, numbers, sizes = [], [], [], []
         for number, chunk in enumerate(self.summary.chunks):
             at = chunk.indexes.get(self.channel)
@@ -232,7 +232,8 @@ class _OtherVersionError(ValueError):
 
 
 def _map_round(path: Path, topic_names: Sequence[str]) -> RoundIndex | None:
-    """Memory-map the round; return None if the file is compressed or has no message index."""
+    """Memory-map the round and index the messages of the topics `topic_names`. Return None if the
+    file is compressed or has no message index."""
     view = map_file(path)
     summary = read_summary(view)
     if not summary.chunks or any(c.compression or not c.indexes for c in summary.chunks):

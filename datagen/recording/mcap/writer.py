@@ -66,8 +66,9 @@ class RoundWriter:
         distance_m: float = 0.0,
         mean_speed_kmh: float = 0.0,
     ) -> RoundResult:
-        """Write the result (totals of the round) and the index, close the file, and return the
-        result."""
+        """Write the result and the index, close the file, and return the result: the totals of the
+        round, that is, the numbers of laps and resets, the distance in m and the mean speed in
+        km/h."""
         result = RoundResult(
             frames=self.frames,
             content_hash=self._content.hexdigest(),
@@ -112,7 +113,7 @@ class RoundFile:
         self.add_metadata(ROUND_METADATA, header.to_metadata())
 
     def add(self, topic: str, log_time: int, step: int, data: bytes | memoryview) -> None:
-        """Append the message `data` of frame `step`; `log_time` in ns."""
+        """Append the serialised message `data` of frame `step` to `topic`; `log_time` is in ns."""
         channel = self._channels[topic]
         self._mcap.add_message(channel, log_time, bytes(data), publish_time=log_time, sequence=step)
 
@@ -151,7 +152,8 @@ class RoundFile:
 
 
 def _chunk_bytes(header: RoundHeader) -> int:
-    """Size of about one second of messages. It is part of the recorded bytes: never change it."""
+    """Return the size (bytes) of a chunk, about one second of messages. The size determines the
+    recorded bytes, so never change this function."""
     pixels = header.camera.width * header.camera.height
     step = pixels * BYTES_PER_PIXEL[header.codec] + OTHER_BYTES
     return int(step * header.frequency_hz)

@@ -108,8 +108,8 @@ def annotations(frame: Frame, time: Timestamp) -> bytes:
 
 
 def caption(features: tf.TrackFeatures) -> str:
-    """Return the labels in one line: distances in m that are present, angle in rad, class of the
-    road."""
+    """Return the features in one line of text: the distances in m that are present, the angle in
+    rad, and the class of the road."""
     distances = " ".join(
         f"{name} {value:.2f}" for name, value in features.distances.items() if value is not None
     )
@@ -185,7 +185,8 @@ def transforms(ego: EgoState, camera: CameraParameters, time: Timestamp) -> byte
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return x, y, z, w of the rotation Rz(yaw) Ry(pitch) Rx(roll); angles in rad."""
+    """Return the quaternion (x, y, z, w) of the rotation Rz(yaw) Ry(pitch) Rx(roll); angles in
+    rad."""
     cr, sr = cos(roll / 2.0), sin(roll / 2.0)
     cp, sp = cos(pitch / 2.0), sin(pitch / 2.0)
     cy, sy = cos(yaw / 2.0), sin(yaw / 2.0)

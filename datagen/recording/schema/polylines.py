@@ -1,7 +1,7 @@
 """Reads the lane markings recorded with an image from its annotations, as polylines in pixels.
 
-Whole numbers are the centres of pixels here. Foxglove's annotations count from the upper left
-corner of the image; `CORNER_PX` is the difference.
+In the polylines, whole numbers are the centres of pixels. Foxglove's annotations count pixels from
+the upper left corner of the image. `CORNER_PX` is the difference between both coordinates.
 """
 
 import numpy as np
