@@ -16,7 +16,8 @@ VECTORS = {
 }
 """Classes for `gymnasium.make_vec`, which step many cars in one call."""
 MAX_STEPS = 6500
-"""Longest episode of the paper (forza), in control steps."""
+"""Number of control steps of the paper's longest episode (on the track forza). Longer episodes are
+truncated."""
 
 
 def register_environments() -> None:

@@ -161,7 +161,7 @@ def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
     """Remove the unfinished files of these rounds that a crash or an interruption has left."""
     for round_id in round_ids:
         discard_partial(folder, round_id)
-    with suppress(OSError):  # it does not exist, or other rounds are being written in it
+    with suppress(OSError):  # the folder is missing, or other rounds are being written
         (folder / PARTIAL).rmdir()
 
 

@@ -83,7 +83,8 @@ def draw(
 
 
 def _near_picture(camera: Projector, pixels: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the points in front of the camera and not far outside the image."""
+    """Return a mask (N,) of the points in front of the camera and not far outside the image.
+    `pixels` (N, 2) and `depth` (N,), m, are the results of `Projector.project`."""
     margin = 0.5 * max(camera.width, camera.height)
     u, v = pixels[:, 0], pixels[:, 1]
     return np.asarray(

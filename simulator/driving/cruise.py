@@ -15,7 +15,7 @@ from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 
 CRUISE_KMH: Final = 60.0
-NATURAL_FREQUENCY: Final = 2.0  # rad/s of the lateral motion
+NATURAL_FREQUENCY: Final = 2.0  # rad/s: natural frequency of the controlled lateral motion
 DAMPING: Final = 0.9
 
 

@@ -13,9 +13,9 @@ from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState
 from simulator.vehicle.surface import SURFACES
 
-YAW_RATE_GAIN: Final = 0.08  # s
+YAW_RATE_GAIN: Final = 0.08  # s: front-wheel angle (rad) per yaw rate (rad/s)
 MIN_SPEED: Final = 5.0  # m/s: bounds the gains, which grow as the speed decreases
-PREVIEW_S: Final = 0.12  # about the sum of the delays of steering rate and control step
+PREVIEW_S: Final = 0.12  # about the delay by the steering rate plus the delay by the control step
 MAX_OFFSET_ERROR: Final = 1.5  # m: larger errors are clipped to this value
 MIN_RADIUS_FACTOR: Final = 0.3  # bounds the curvature of the path on the inside of tight bends
 

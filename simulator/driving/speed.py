@@ -13,15 +13,15 @@ from simulator.traffic.traffic import Traffic
 from simulator.vehicle.car import GRAVITY, RPM, CarParameters
 from simulator.vehicle.state import CarState
 
-LATERAL_ACCELERATION = 4.0  # m/s2 in bends
-BRAKING = 2.5  # m/s2 before bends
+LATERAL_ACCELERATION = 4.0  # m/s2: largest value in bends
+BRAKING = 2.5  # m/s2: largest deceleration before bends
 PREVIEW_S = 0.5
 CELL_M = 1.0
 SHIFT_UP_RPM, SHIFT_DOWN_RPM = 5500.0, 2600.0
 TOP_GEAR = 4
 MAX_THROTTLE = 0.9
-INTEGRAL_GAIN = 0.15  # 1/s2
-INTEGRAL_LIMIT = 1.0  # m/s2
+INTEGRAL_GAIN = 0.15  # 1/s2: acceleration (m/s2) per integrated error of the speed (m)
+INTEGRAL_LIMIT = 1.0  # m/s2: largest acceleration that the integral adds
 
 
 @dataclass(frozen=True)
@@ -38,22 +38,25 @@ class SpeedProfile:
 
 
 def speed_profile(track: Track, desired: float, innermost_y: float) -> SpeedProfile:
-    """Compute the profile with limits of at most `desired` (m/s). `innermost_y` (m) is the largest
-    offset to the inside of the centre line at which bends are driven."""
+    """Compute the speed profile of `track`. Its limits allow for bends and braking and are at most
+    `desired` (m/s). `innermost_y` (m) is the largest offset to the inside of the centre line at
+    which bends are driven."""
     bends = bend_profile(track, innermost_y)
     return SpeedProfile(np.minimum(bends.limit, desired), bends.cell_m)
 
 
 def bend_profile(track: Track, innermost_y: float) -> SpeedProfile:
-    """Compute a profile that is limited only by bends and by braking before them. `innermost_y` (m)
-    is the largest offset to the inside of the centre line at which bends are driven."""
+    """Compute the speed profile of `track` that only bends and the braking before them limit.
+    `innermost_y` (m) is the largest offset to the inside of the centre line at which bends are
+    driven."""
     cells = int(np.ceil(track.length_m / CELL_M))
     cell = track.length_m / cells
     bend = np.abs(track.at((np.arange(cells) + 0.5) * cell).curvature)
     bend = bend / np.maximum(1.0 - bend * innermost_y, 0.3)
     squared = np.tile(LATERAL_ACCELERATION / np.maximum(bend, 1e-6), 2)
-    # v^2 can decrease by 2 * BRAKING per metre; the most restrictive bend ahead decides. Two laps
-    # are computed, because the car brakes at the end of a lap for the bends at its start.
+    # v^2 can decrease by 2 * BRAKING per metre. The bend ahead that requires the lowest speed here
+    # sets the limit. Two laps are computed, because at the end of a lap the car brakes for the
+    # bends of the next lap.
     drop = 2.0 * BRAKING * cell * np.arange(2 * cells)
     allowed = np.minimum.accumulate((squared + drop)[::-1])[::-1] - drop
     return SpeedProfile(np.sqrt(allowed[:cells]), cell)
@@ -94,7 +97,8 @@ class Pedals:
         return min(throttle, MAX_THROTTLE), 0.0, gear
 
     def _choose_gear(self, speed: float) -> int:
-        """Return the gear for `speed` (m/s), changed by at most one from the last call's gear."""
+        """Return the gear for `speed` (m/s). It differs by at most one from the gear of the last
+        call."""
         if self._rpm(speed, self._gear) > SHIFT_UP_RPM and self._gear < TOP_GEAR:
             self._gear += 1
         elif self._rpm(speed, self._gear) < SHIFT_DOWN_RPM and self._gear > 1:
@@ -122,14 +126,15 @@ class Pedals:
 
 
 class TargetSpeed:
-    """Computes throttle, brake and gear that reach a speed and keep the distance to a leader."""
+    """Computes throttle, brake and gear that reach a speed and keep the distance to the car ahead
+    (the leader)."""
 
     def __init__(self, car: CarParameters, step_s: float) -> None:
         """`step_s` is the time between two commands (s)."""
         self._pedals = Pedals(car)
         self._step_s = step_s
         self.following = False
-        """Whether the distance to a leader limited the acceleration of the last command."""
+        """Whether the distance to the car ahead limited the acceleration of the last command."""
 
     def reset(self) -> None:
         self._pedals.reset()
@@ -154,12 +159,13 @@ class TargetSpeed:
 
 class SpeedControl:
     """Computes throttle, brake and gear that follow a speed profile of the track and keep the
-    distance to a leader."""
+    distance to the car ahead."""
 
     def __init__(
         self, profile: SpeedProfile, track: Track, car: CarParameters, step_s: float
     ) -> None:
-        """`step_s` is the time between two commands (s)."""
+        """`profile` contains the speed limits, and `step_s` is the time between two commands
+        (s)."""
         self._profile = profile
         self._track = track
         self._follower = TargetSpeed(car, step_s)

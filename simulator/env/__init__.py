@@ -6,11 +6,11 @@
     gymnasium.make("driverview/LateralControl-v0", track="circuit", lanes=1, frequency_hz=20)
     gymnasium.make("driverview/DriverView-v0", track="forza", views=("front", "rear"))
 
-many cars in one compiled call (see `simulator.env.vector`):
+One compiled call steps many cars in a vector environment (see `simulator.env.vector`):
 
     gymnasium.make_vec("driverview/LateralControl-v0", 256, "vector_entry_point", track="random")
 
-or without the second import, in Gymnasium's syntax for names that a module registers:
+The import of `simulator.env` is not needed with Gymnasium's syntax MODULE:NAME:
 
     gymnasium.make("simulator.env:driverview/LateralControl-v0")
 

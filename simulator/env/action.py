@@ -42,8 +42,9 @@ def action_space(controls: Controls) -> gym.spaces.Box:
 
 
 def to_command(action: Any, controls: Controls) -> Command:
-    """Convert `action` (1,) or (4,) to a command; the gear is rounded. Values beyond their bounds
-    by no more than float32 rounding are clipped. Raises UserError for values farther outside."""
+    """Convert `action`, (1,) for the controls "steer" or (4,) for "full", to a command; the gear is
+    rounded. Values beyond their bounds by no more than float32 rounding are clipped. Raises
+    UserError for values farther outside."""
     names = NAMES[controls]
     values = _numbers("action", action)
     if values.shape != (len(names),):
@@ -89,7 +90,8 @@ def to_rows(actions: Any, controls: Controls, moving: NDArray[np.bool_]) -> Floa
 
 @contextmanager
 def naming_car(number: int, count: int) -> Iterator[None]:
-    """Prefix the message of a UserError with the number of the car, if there are several cars."""
+    """Prefix the message of a UserError with the number of the car, if there are several cars
+    (`count` is above 1)."""
     try:
         yield
     except UserError as error:
@@ -99,7 +101,8 @@ def naming_car(number: int, count: int) -> Iterator[None]:
 
 
 def _numbers(what: str, given: Any) -> FloatArray:
-    """Return `given` as a float64 array. Raises UserError, which contains `what`, if it is none."""
+    """Return `given` as a float64 array. Raises UserError, which contains `what`, unless `given`
+    consists of numbers."""
     try:
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError) as error:  # torch raises RuntimeError
@@ -107,7 +110,8 @@ def _numbers(what: str, given: Any) -> FloatArray:
 
 
 def _clip(name: str, value: float, low: float, high: float) -> float:
-    """Clip a value that exceeds its bound by float32 rounding. Raises UserError for others."""
+    """Clip `value` to the bounds `low` and `high` if it exceeds one of them only by float32
+    rounding. Raises UserError, which contains `name`, for a value farther outside."""
     clipped = clip_rounding(value, low, high)
     if not low <= clipped <= high:
         raise UserError(

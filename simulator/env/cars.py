@@ -33,7 +33,7 @@ from trackfeatures.definitions import MARKINGS
 from trackfeatures.state_vector import STATE_SIZE
 
 FEATURES = (*MARKINGS, "to_lane_centre")
-"""Names of the features in the columns of `results` from DISTANCES_AT on."""
+"""Names of the features in the columns of `results` from DISTANCES_AT on (see `control_step`)."""
 
 
 class Cars:
@@ -86,7 +86,8 @@ class Cars:
         return self.beams[number] if self.beams.size else None
 
     def reset(self, number: int, rng: np.random.Generator, start: Mapping[str, Any]) -> int:
-        """Begin an episode of a car at `start` (options of `reset`); returns the episode's seed."""
+        """Begin an episode of car `number` at `start`, the options of `reset`. Returns the
+        episode's seed."""
         seed = self.drives[number].reset(rng, start)
         self._draw_noise(number, rng)
         observe_cars(number, number + 1, self.fleet.arrays, self._outputs, self._rules, True)
@@ -122,12 +123,14 @@ class Cars:
                     self._reward(number)
 
     def ending(self, number: int) -> Ending | None:
-        """Return the event that ended the episode of a car; None if the episode continues."""
+        """Return the event that ended the episode of car `number`; None if the episode
+        continues."""
         code = int(self.results[number, ENDED])
         return ENDINGS[code - 1] if code else None
 
     def features(self, number: int) -> dict[str, float]:
-        """Return a car's features by name. Absent features have no entry, as Gymnasium requires."""
+        """Return the features of car `number` by name. Absent features have no entry, as Gymnasium
+        requires."""
         row = self.results[number].tolist()
         found = dict(zip(FEATURES, row[DISTANCES_AT : TO_LANE_CENTRE + 1], strict=True))
         present = {name: value for name, value in found.items() if value == value}

@@ -57,17 +57,18 @@ for function in (
 ):
     callable_from_compiled(function)
 
-# Columns of a row of `results` (RESULT,): reward; 1 + index of the ending, 0 for none; sum of the
-# rewards; the five distances and the offset from the lane's centre (m), NaN if absent; class of the
-# road.
+# Columns of a row of `results` (RESULT,): reward; 1 + index of the event that ended the episode, or
+# 0 if it continues; sum of the rewards of the episode; the five distances and the offset from the
+# lane's centre (m), NaN if absent; class of the road.
 REWARD, ENDED, SCORE, DISTANCES_AT, TO_LANE_CENTRE, HEADING, RESULT = 0, 1, 2, 3, 8, 9, 10
 
 Outputs = tuple[NDArray[np.float32], FloatArray, FloatArray, FloatArray]
 """States (N, STATE_SIZE), results (N, RESULT), range beams (N, B) in m, and the noise to add to the
 states, (N, STATE_SIZE) or (N, 0)."""
 Rules = tuple[int, bool, float, float, FloatArray]
-"""`ends_code` of the events that end an episode; whether the reward is `step_reward`; its weight
-lambda; bound of the states; angles (B,) of the beams in rad."""
+"""The rules of an environment: `ends_code` of the events that end an episode; whether the reward is
+`step_reward`; the weight lambda of `step_reward`; the bound to which the values of the state
+vectors are clipped; the angles (B,) of the range beams in rad."""
 
 
 @compiled_for_threads

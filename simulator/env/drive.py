@@ -17,7 +17,8 @@ from simulator.world.fleet import Fleet
 from simulator.world.world import World, check_place
 
 RANDOM_ROADS = 256
-"""Number of roads of `track="random"`. Each is built only once, because that takes about 30 ms."""
+"""Number of roads of `track="random"`. Each road is built only once, because building it takes
+about 30 ms."""
 
 
 class RoadShop:
@@ -84,7 +85,8 @@ class Drive:
         return start
 
     def _make_world(self, rng: np.random.Generator | None) -> World:
-        """Build the world with a road and car from `rng`; None gives the least values."""
+        """Build the world with a road and a car that are random by `rng`. If `rng` is None, every
+        random value is the least of its range."""
         options = self._options
         road, car = self._make_road(rng), options.car(rng)
         return World(
@@ -97,7 +99,8 @@ class Drive:
         )
 
     def _make_road(self, rng: np.random.Generator | None) -> Road:
-        """Build the road of an episode, random by `rng`; None gives the first one."""
+        """Build the road of an episode, random by `rng`. If `rng` is None, every random value is
+        the least of its range, and `track="random"` gives the first random road."""
         options, track, lanes = self._options, self._options.track, self._options.lanes
         if track == RANDOM:
             track = random_name(0 if rng is None else int(rng.integers(RANDOM_ROADS)))

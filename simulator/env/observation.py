@@ -23,7 +23,8 @@ Observation = dict[str, NDArray[Any]] | NDArray[Any]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 PAPER_STATE_NOISE = 0.05
 STATE_LIMIT = 10.0
-"""Bound of the state in its space (ten half widths, 750 km/h), which no drive reaches."""
+"""Bound of the absolute values of the state in its observation space: an offset of ten half widths
+of the track, or a speed of 750 km/h. No drive reaches it."""
 STATE, IMAGE = "state", "image"
 
 

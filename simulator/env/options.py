@@ -107,7 +107,8 @@ OPTIONS = (DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions)
 def split_options(
     given: dict[str, Any],
 ) -> tuple[DriveOptions, EpisodeOptions, ObservationOptions, RenderOptions]:
-    """Split keyword arguments into four groups of options. Raises UserError for unknown names."""
+    """Split the keyword arguments `given` into four groups of options. Raises UserError for unknown
+    names."""
     names = [field.name for group in OPTIONS for field in fields(group)]
     for name in given:
         if name not in names:
@@ -135,7 +136,8 @@ def draw(setting: Any, rng: np.random.Generator | None) -> Any:
 
 
 def ends_of(name: str, setting: Any) -> tuple[float, ...]:
-    """Return both ends of a range; a number is both ends. Raises UserError for anything else."""
+    """Return both ends of the range `setting`. If `setting` is a number, it is both ends. Raises
+    UserError, which contains `name`, for anything else."""
     given = setting if isinstance(setting, tuple) else (setting, setting)
     try:
         ends = tuple(float(value) for value in given)

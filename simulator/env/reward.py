@@ -32,9 +32,9 @@ Reward = Callable[[CarState, Road, Ending | None], float]
 def ending_code(off_track: bool, backwards: bool, wall: bool, touched: bool, ends: int) -> int:
     """Return 1 + the index into ENDINGS of the event that ends an episode; 0 if it continues.
 
-    wall: the car touches a wall; touched: it touches anything; ends: `ends_code` of the events that
-    end an episode. Contact with a wall counts as "off_track", or as "collision" if "off_track" does
-    not end an episode.
+    off_track, backwards: the car is off the track, or drives backwards; wall: it touches a wall;
+    touched: it touches anything; ends: `ends_code` of the events that end an episode. Contact with
+    a wall counts as "off_track", or as "collision" if "off_track" does not end an episode.
     """
     # Walls stand 2.5 m beyond the edge, so the car is off the track before it touches one. The
     # contact counts even if the car is back on the road by the end of the same control step.
@@ -70,8 +70,8 @@ def step_reward(
     ended: bool,
     weight: float = 1.0,
 ) -> float:
-    """Return cos(angle) - weight |sin(angle)| - |to_middle| / half_width, or -2 if the episode ends
-    or the car points backwards (|angle| >= pi/2).
+    """Return cos(angle) - weight |sin(angle)| - |to_middle| / half_width. If the episode ends
+    (`ended`) or the car points backwards (|angle| >= pi/2), return -2.
 
     angle in rad; to_middle and half_width (half of the track's own width) in m; weight is the
     paper's lambda. A score is the sum over a fixed number of steps.
@@ -83,7 +83,7 @@ def step_reward(
 
 @callable_from_compiled
 def quadratic_reward(offset: float, angle: float, steer: float, ended: bool) -> float:
-    """Return -(0.3 offset^2 + angle^2 + 0.03 delta^2), or -2 if the episode ends.
+    """Return -(0.3 offset^2 + angle^2 + 0.03 delta^2), or -2 if the episode ends (`ended`).
 
     offset in m from the line to follow; angle in rad; delta is the angle of the front wheels in rad
     for the steering action `steer` in [-1, 1].
@@ -129,7 +129,8 @@ class EpisodeOptions:
 
     def compute_reward(self, state: CarState, road: Road, ended: Ending | None) -> float:
         """Return the number that the user's function `reward`, which must not be None, gives for a
-        step that led to `state`. Raises UserError unless the number is finite."""
+        step that led to `state` and to the event `ended`, or None. Raises UserError unless the
+        number is finite."""
         assert self.reward is not None
         reward = float(self.reward(state, road, ended))
         if not math.isfinite(reward):

@@ -64,7 +64,9 @@ def _add(
     present: NDArray[np.bool_],
     everyone: bool,
 ) -> None:
-    """Add a column to `info`. Cars without the entry get 0, or None in a column of strings."""
+    """Add `column` (N,) to `info` as the entry `name`, and the mask `present` (N,) of the cars that
+    have the entry. Cars without it get 0, or None in a column of objects. `everyone` is true if all
+    cars have the entry."""
     absent: Any = None if column.dtype == object else 0
     info[name] = column.copy() if everyone else np.where(present, column, absent)
     info[f"_{name}"] = present.copy()

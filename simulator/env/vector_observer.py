@@ -60,8 +60,8 @@ class VectorObserver:
 
     def observe(self, chosen: NDArray[np.bool_]) -> Any:
         """Return the observations of all cars. The pictures are drawn and the sensors are read only
-        for the `chosen` cars (N,); for the remaining cars they are as they were at the last
-        call."""
+        for the `chosen` cars (N,). The pictures and readings of the remaining cars are the ones of
+        the last call."""
         kind: Kind | None = self._first.kind
         if kind == "state":
             return self._cars.states.copy()

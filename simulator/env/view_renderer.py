@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options for rendering the views. Scenery and light depend only on `light_seed`."""
+    """Options for rendering the views. The random values of scenery and light depend only on
+    `light_seed`, so they are equal in all episodes on the same road."""
 
     width: int = 280
     height: int = 210

@@ -71,8 +71,8 @@ class Link:
         speed: float = 0.0,
     ) -> Message:
         """Start an episode and return its first message. `s` (m along the centre line) defaults to
-        25 m before the line; `to_middle` is in m, left positive, `angle` (track tangent minus yaw)
-        in rad, `speed` in m/s. Without `seed` the server chooses a seed."""
+        25 m before the start line; `to_middle` is in m, left positive, `angle` (track tangent minus
+        yaw) in rad, `speed` in m/s. Without `seed` the server chooses a seed."""
         record = self._outbox.record
         record["request"] = Request.RESET
         record["seed"] = -1 if seed is None else seed

@@ -35,7 +35,8 @@ class ServerInfo:
 
 
 def write_header(segment: Segment, info: ServerInfo) -> None:
-    """Write the header into a new segment, before `Segment.publish` makes it visible to clients."""
+    """Write the header with the server's properties `info` into a new segment, before
+    `Segment.publish` makes the segment visible to clients."""
     record = _record(segment)
     record["magic"] = MAGIC
     record["byte_order"] = layout.BYTE_ORDER

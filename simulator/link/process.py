@@ -93,7 +93,8 @@ def describe(world: World, config: LinkConfig) -> ServerInfo:
 def _warm_up(
     simulation: Callable[[Any, NDArray[np.uint8]], Simulation], config: LinkConfig
 ) -> None:
-    """Compile all functions and render a first image before the first client connects."""
+    """Compile all functions and render a first image before the first client connects. `simulation`
+    builds the Simulation."""
     state, command = np.zeros(1, STATE.dtype)[0], np.zeros(1, COMMAND.dtype)[0]
     trial = simulation(state, np.zeros(image_bytes(*config.picture), np.uint8))
     for request in (Request.RESET, Request.STEP):

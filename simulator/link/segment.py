@@ -121,7 +121,8 @@ def check_name(name: str) -> str:
 
 
 def create(name: str, size: int) -> Segment:
-    """Create a segment of zeros with the role of the server. It has no name until it is published.
+    """Create a segment of `size` bytes, all 0, with the role of the server. It has no name until it
+    is published.
 
     All memory is allocated at once, because a later write to a page without memory would cause a
     bus error. Raises LinkError if there is not enough memory.

@@ -118,8 +118,8 @@ class LinkServer:
         self.close()
 
     def _wait_for_command(self) -> bool:
-        """Wait at most POLL_INTERVAL_S, or in real time until the next step, for a command. Returns
-        whether one arrived. In real time, step if none arrived."""
+        """Wait for a command, at most POLL_INTERVAL_S or, in real-time mode, until the next step is
+        due. Returns whether a command arrived. In real-time mode, step if no command arrived."""
         if self._pacer is None or not self._simulation.running:
             return self._inbox.wait(POLL_INTERVAL_S)
         self._outbox.record["late_steps"] += self._pacer.wait()
@@ -179,7 +179,7 @@ class LinkServer:
             )
 
     def _drop_client(self) -> None:
-        """End the session of a client that has died. Raises ClientLost with `once`."""
+        """End the session of a client that has died. Raises ClientLost if `once` is set."""
         message = f"client {self._pid} has died {self._simulation.position_text}"
         self._session = 0
         self._lost += 1

@@ -144,8 +144,8 @@ class Simulation:
             self._measure(state, stepped=True)
 
     def _measure(self, state: CarState, *, stepped: bool) -> None:
-        """Write state, features, ranges, reward and image into the record. The reward of a reset is
-        0."""
+        """Write state, features, ranges, reward and image into the record. `stepped` is false after
+        a reset; the reward is then 0."""
         record, world = self._record, self._world
         ended = ending(state)
         reward = 0.0

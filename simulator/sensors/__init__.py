@@ -1,4 +1,5 @@
-"""The sensors of Li et al.'s table of sensors, and a class to declare additional sensors."""
+"""The sensors of the table of sensors in the paper (Li et al.), and a class to declare additional
+sensors."""
 
 from simulator.sensors.sensor import Reading, Sensor, SensorSuite
 from simulator.sensors.standard import STANDARD, camera_sensor, sensors_of

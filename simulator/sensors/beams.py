@@ -122,8 +122,9 @@ def crosses_end(
     along: float, k: float, u: float, v: float, cu: float, cv: float, move: int
 ) -> float:
     """Return the distance (m) along a ray at which it crosses the normal of the centre line `along`
-    m from the start of a piece of curvature `k` (1/m); the ray is given as in `leaves_edges`.
-    Returns infinity unless the ray crosses it forwards (`move` = 1) or backwards (`move` = -1)."""
+    m from the start of a piece of curvature `k` (1/m). The ray starts at (u, v) m with the unit
+    direction (cu, cv), as in `leaves_edges`. Returns infinity unless the ray crosses the normal
+    forwards (`move` = 1) or backwards (`move` = -1)."""
     half_turn = 0.5 * along * k
     sin_half, cos_half = math.sin(half_turn), math.cos(half_turn)
     chord = along if half_turn == 0.0 else along * sin_half / half_turn

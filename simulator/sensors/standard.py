@@ -1,4 +1,5 @@
-"""The sensors of Li et al.'s table of sensors, with the ranges and units of that table.
+"""The sensors of the table of sensors in the paper (Li et al.), with the ranges and units of that
+table.
 
 v_x and v_y are signed components in the body frame, so their limits are signed too. Speed and wheel
 spin are magnitudes, as in the table.

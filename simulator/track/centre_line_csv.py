@@ -28,21 +28,23 @@ FARTHEST_M: Final = 1e7
 STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
-"""Approximate length of a piece."""
+"""Approximate length (m) of a piece of the track."""
 NOISE_M: Final = (0.05, 1.0)
-"""Bounds (m, RMS) of the smoothed noise; between them it is estimated from the points."""
+"""Least and greatest noise (m, RMS) of the points that the smoothing assumes. Between these bounds
+the noise is estimated from the points."""
 SMOOTHER: Final = 1.2
-"""Factor on the noise's variance. It is above 1, because too much smoothing still gives a road, but
-too little gives a wavy one."""
+"""Factor on the variance of the noise that the smoothing removes. It is above 1, because too much
+smoothing still gives a road, but too little smoothing gives a wavy road."""
 MIN_RADIUS_M: Final = 5.0
-"""A line with a smaller radius is an error of the survey, not a road."""
+"""A centre line with a smaller radius (m) is an error of the survey, not a road."""
 MAX_GAP_M: Final = 1e-3
 HEADER: Final = "s,x,y,z,ang,curv\n"
 ROW: Final = "%.6f,%.6f,%.6f,%.6f,%.9f,%.9f\n"
 
 
 def read_centre_line(path: Path) -> Track:
-    """Read a flat track along the points of a CSV file; its width is the median of their widths.
+    """Read a flat track along the points of a CSV file. The track's width is the median of the
+    widths at the points.
 
     Raises TrackError for a file that is not of this format, or if its points are no closed road.
     """
@@ -177,8 +179,9 @@ def survey_noise(points: FloatArray) -> float:
 
 
 def _closing_lengths(length: FloatArray, turn: FloatArray, heading: float) -> FloatArray:
-    """Return the arc lengths, changed as little as possible with constant turns, so that the end of
-    the last arc meets the start of the first."""
+    """Change the lengths (n,) of arcs as little as possible, so that the end of the last arc meets
+    the start of the first; return the new lengths (m). Arc i turns by `turn[i]` (rad), which stays
+    constant; the first arc starts in the direction `heading` (rad)."""
     middle = heading + np.concatenate(([0.0], np.cumsum(turn)[:-1])) + turn / 2.0
     chord = np.sinc(turn / (2.0 * np.pi)) * np.stack((np.cos(middle), np.sin(middle)))
     gap = chord @ length

@@ -26,20 +26,23 @@ class Straight:
 
 @dataclass(frozen=True)
 class Bend:
-    """A clothoid of length `spiral`, an arc, and the same clothoid back to straight."""
+    """A bend: a clothoid of length `spiral` (m), an arc of `radius` (m), and the same clothoid back
+    to straight."""
 
     radius: float
     angle: float
-    """Turn of the whole bend, including its spirals."""
+    """Turn (rad, left positive) of the whole bend, including its spirals."""
     spiral: float
     banking: float
-    """Lateral slope angle, outer edge up; it grows along the spiral like the curvature."""
+    """Lateral slope angle (rad), positive if the outer edge is higher. It grows along the spiral
+    like the curvature."""
     grade: float
 
 
 Segment = Straight | Bend
 Row = tuple[float, float, float, int]
-"""Length, curvature, banking at the end (left edge up), and index of the segment of one step."""
+"""One step: length (m), curvature (1/m), banking at the end (rad, positive if the left edge is
+higher), and index of the segment to which the step belongs."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,8 @@ def cut(segments: list[Segment]) -> Steps:
         rows += ramp
         if arc > 0.0:
             rows += _even(arc, k, -sign * segment.banking, number)
-        # The exit spiral is the entry spiral reversed, so the start banking of a step is its end.
+        # The exit spiral is the entry spiral in reverse order. So the banking at the end of a step
+        # of the exit spiral is the banking at the start of the same step of the entry spiral.
         starts = [0.0] + [banking for _, _, banking, _ in ramp[:-1]]
         rows += [
             (length, curvature, start, number)
@@ -86,7 +90,8 @@ def _even(length: float, k: float, banking: float, number: int) -> list[Row]:
 
 
 def _spiral(bend: Bend, sign: float, number: int) -> list[Row]:
-    """Return the steps of a bend's entry spiral; `sign` is 1 for a left bend, else -1."""
+    """Return the steps of a bend's entry spiral. `sign` is 1 for a left bend, else -1; `number` is
+    the index of the bend in the list of segments."""
     count = math.ceil(bend.spiral / SPIRAL_STEP_M - 1e-9)
     # With the curvature at the middle of each step, the sum of the turns is the clothoid's.
     return [
@@ -146,7 +151,8 @@ def segment_length(segment: Segment) -> float:
 
 
 def heights(segments: list[Segment], s: FloatArray, vertical_curve: float) -> FloatArray:
-    """Return the heights (n,) of the centre line at `s` in [0, L], zero at the start of the lap.
+    """Return the heights (n,) in m of the centre line at `s` (n,) m, from 0 to the length of the
+    lap. The height at the start of the lap is 0.
 
     The mean grade is subtracted, so that the lap ends at the height of its start. The grades are
     averaged over `vertical_curve` metres, which gives parabolic crests and dips as on real roads.

@@ -24,8 +24,8 @@ class MarkingStyle:
 
 
 def imported_style(name: str, *, kerbs: bool) -> MarkingStyle:
-    """Return a random style for a track file without information on paint; the track's name is the
-    seed."""
+    """Return a random style for a track file without information on paint, with kerbs if `kerbs` is
+    true. The track's `name` is the seed."""
     draw = hashlib.sha256(name.encode()).digest()
     dash_length, dash_gap = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))[draw[1] % 4]
     return MarkingStyle(

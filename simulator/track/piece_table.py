@@ -17,14 +17,16 @@ S0, LENGTH, X0, Y0, HEADING0, CURVATURE = 0, 1, 2, 3, 4, 5
 Z_LEFT0, Z_RIGHT0, Z_LEFT1, Z_RIGHT1 = 6, 7, 8, 9
 HALF_WIDTH, TRACK_LENGTH = 10, 11
 GEOMETRY = 12
-"""Number of columns that define the track; the columns after them are computed from these once."""
+"""Number of columns that define the track. The columns after these columns are computed from them
+once."""
 COS0, SIN0, LEFT_SLOPE, RIGHT_SLOPE = 12, 13, 14, 15
 COLUMNS = 16
 
 MAX_WALK = 64
 """Largest number of pieces that a search walks from the hint before all pieces are searched."""
 HINT_REACH_M = 40.0
-"""A foot point farther away may belong to another part of the track than the hinted one."""
+"""Largest distance (m) of a point from the centre line for which a search near the hint is trusted.
+A point farther away may belong to another part of the track."""
 
 
 @inlined
@@ -147,7 +149,7 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
             move = -1
         elif along > length:
             move = 1
-        # If the search turns back, the point lies in the joint between two pieces.
+        # If the search turns back, the point's foot is the joint between two pieces.
         if move == 0 or move == -last_move:
             along = min(max(along, 0.0), length)
             if abs(d) > HINT_REACH_M or d * table[index, CURVATURE] >= 1.0:
@@ -162,7 +164,8 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
 def surface(
     table: Table, index: int, s: float, to_middle: float
 ) -> tuple[float, float, float, float]:
-    """Return height and unit normal (z, nx, ny, nz) of the road plane at (s, to_middle) on a piece.
+    """Return height and unit normal (z, nx, ny, nz) of the road plane at (s, to_middle) on piece
+    `index`.
 
     Beyond the track's width the banked plane continues.
     """
@@ -192,7 +195,8 @@ def surface(
 
 @compiled
 def foot_offset(table: Table, index: int, s: float, to_middle: float, z: float) -> float:
-    """Return the lateral offset (m) of the foot of a point at (s, to_middle, z) on the road plane.
+    """Return the lateral offset (m) of the foot of a point at (s, to_middle, z) on the road plane
+    of piece `index`.
 
     The foot is the nearest point of the road plane. On a banked road it does not lie vertically
     below the point, but further up the bank.

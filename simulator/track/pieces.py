@@ -122,8 +122,9 @@ def put(
 
 
 def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> None:
-    """Raises TrackError unless the end of the last piece is within `max_gap_m` (horizontally and in
-    height) and 0.5 deg of the start of the first. `what` names the track in the message."""
+    """Raises TrackError unless the pieces `placed` form a closed loop: the end of the last piece
+    must be within `max_gap_m` (horizontally and in height) and 0.5 deg of the start of the first.
+    `what` names the track in the message."""
     x, y, heading = placed.end
     gap = math.hypot(x - placed.x0[0], y - placed.y0[0])
     height = max(

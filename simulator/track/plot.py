@@ -146,7 +146,8 @@ def _plan(axes: "Axes", lap: Lap) -> None:
 
 
 def _distances(axes: "Axes", lap: Lap) -> None:
-    """Draw ticks across the road with their distances, on the outer side of the loop."""
+    """Draw ticks across the road at equal distances. Write the distance (m) from the start line
+    beside each tick, on the outer side of the loop."""
     from matplotlib.patheffects import withStroke
 
     track = lap.road.track
@@ -166,7 +167,8 @@ def _distances(axes: "Axes", lap: Lap) -> None:
         axes.annotate(
             f"{distance:,.0f}",
             _point(place + side * reach * across[:, k]),
-            _point(side * across[:, k] * (18.0, 9.0)),  # a number is wider than high
+            # The horizontal distance is larger, because the text of a number is wider than high.
+            _point(side * across[:, k] * (18.0, 9.0)),
             textcoords="offset points",
             ha="center",
             va="center",

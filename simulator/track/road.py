@@ -11,9 +11,9 @@ from simulator.varied.carriageway import Carriageway
 from trackfeatures.errors import UserError
 
 START_BEFORE_LINE_M = 25.0
-"""Distance from the start of a drive to the start line."""
+"""Distance (m) by which the start of a drive lies before the start line."""
 SHOULDER_M = 1.0
-"""Width of the asphalt beyond the outermost marking."""
+"""Width (m) of the asphalt beyond the outermost marking."""
 WALL_MARGIN_M = 2.5
 """Distance from the edge to the rails and walls. It exceeds half of a car's diagonal (2.46 m), so
 that a car has left the track before any part of it touches a wall."""
@@ -104,8 +104,9 @@ class Road:
 
     @property
     def line_offsets(self) -> tuple[tuple[float, float], ...]:
-        """For each marking, offsets (left positive) to the lines that bound the lanes on its left
-        and on its right; empty if all of them are 0."""
+        """For each marking, the offsets (m, left positive) from its position to the line that
+        bounds the lane to its left and to the line that bounds the lane to its right. Empty if the
+        road is not varied (it has no carriageway)."""
         if self.carriageway is None:
             return ()
         return tuple((marking.left_m, marking.right_m) for marking in self.carriageway.markings)

@@ -108,7 +108,8 @@ def build_track(table: Table, name: str) -> Track:
 
 
 def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
-    """Return the SHA-256 (hex) of the numbers of a definition.
+    """Return the SHA-256 (hex) of the numbers of a definition: the segments as `written`, the
+    `width` (m) and `vertical_curve` (m).
 
     The computed geometry differs by 1e-12 m between machines, because their libraries round sines
     differently. Parsed decimals and their products do not differ.
@@ -124,7 +125,8 @@ def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
 
 
 def _closed(written: list[Segment], where: str) -> list[Segment]:
-    """Close the loop of the segments. Raises TrackError if this changes a straight too much."""
+    """Close the loop of the segments `written` in the file. Raises TrackError, which contains
+    `where`, if this changes a straight too much."""
     try:
         segments, correction = close(written)
     except TrackError as error:
@@ -161,7 +163,8 @@ def read_segments(table: Table) -> list[Segment]:
 
 
 def _bend(entry: Table, grade: float) -> Bend:
-    """Read a bend from its table. Raises TrackError if its spirals do not fit."""
+    """Read a bend with the slope `grade` (dz/ds) from its table. Raises TrackError if its spirals
+    do not fit."""
     entry.only("type", "radius", "angle", "spiral", "banking", "grade")
     radius = entry.number("radius", 8.0, 10_000.0)
     angle = math.radians(entry.number("angle", -360.0, 360.0))

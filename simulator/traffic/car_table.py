@@ -17,7 +17,8 @@ from simulator.traffic.idm import COMFORTABLE_BRAKING, STANDSTILL_GAP_M, idm_acc
 S, Y, SPEED, DESIRED, Y_FROM, Y_TO, CHANGE_PROGRESS, CHANGE_LENGTH_M, COOLDOWN_S, STRUCK = range(10)
 CAR_COLUMNS = 10
 # CHANGE_PROGRESS rises from 0 to 1 during a lane change of CHANGE_LENGTH_M. COOLDOWN_S is the time
-# until the next may start. A car with STRUCK = 1 was hit: it is an obstacle that physics moves.
+# until the next lane change may start. A car with STRUCK = 1 was hit; physics moves it, and for the
+# other cars it is an obstacle.
 # Columns of a body's row: extent and speed of a car, for the decisions of other cars; the last row
 # is the ego car.
 B_S, B_RIGHT, B_LEFT, B_SPEED, B_HALF_LENGTH, B_DESIRED = range(6)
@@ -29,8 +30,8 @@ MIN_CHANGE_LENGTH_M = 25.0
 CHANGE_COOLDOWN_S = 3.0
 SAFE_BRAKING = COMFORTABLE_BRAKING  # m/s2: largest braking that a lane change may cause
 MIN_GAIN = 0.2  # m/s2: least gain in acceleration for a lane change
-MIN_LENGTH_RATIO = 0.05  # least ratio of lane length to centre-line length in a bend
-POLITENESS = 0.2  # MOBIL: weight of the new follower's loss
+MIN_LENGTH_RATIO = 0.05  # least assumed ratio of lane length to centre-line length in a bend
+POLITENESS = 0.2  # MOBIL: weight of the acceleration that the new follower loses
 
 
 @compiled
@@ -89,8 +90,10 @@ def following_acceleration(
     half_length: float,
     length: float,
 ) -> float:
-    """Return the IDM acceleration (m/s2) of the car `me` at `s` with `speed` and the desired speed
-    `desired` (m/s), behind the nearest body in the lateral range `right` to `left` (m)."""
+    """Return the IDM acceleration (m/s2) of the car `me`, a row of `bodies`, behind the nearest
+    body in the lateral range `right` to `left` (m). The car is at `s` (m), drives at `speed` (m/s),
+    wants to drive at `desired` (m/s), and is 2 x `half_length` (m) long. `length` (m) is the length
+    of the lap."""
     lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     lead_speed = bodies[lead, B_SPEED] if lead >= 0 else speed
     return idm_acceleration(gap, speed, lead_speed, desired)
@@ -107,9 +110,10 @@ def lane_change_safe(
     half_length: float,
     length: float,
 ) -> tuple[bool, float]:
-    """Return whether the car `me` at `s` may change into the lateral range `right` to `left` (m),
-    that is, whether the gaps to the new leader and to the new follower are safe; and the
-    acceleration (m/s2) that the new follower loses."""
+    """Return whether the car `me` (a row of `bodies`) at `s` (m) may change into the lateral range
+    `right` to `left` (m), that is, whether the gaps to the new leader and to the new follower are
+    safe. Also return the acceleration (m/s2) that the new follower loses. `half_length` (m) is half
+    the length of the car, `length` (m) the length of the lap."""
     lead, gap = nearest_body(bodies, me, s, right, left, half_length, length, True)
     if lead >= 0:
         lead_speed = bodies[lead, B_SPEED]

@@ -25,13 +25,14 @@ EGO_CAR_SIZE = (CarParameters.length, CarParameters.width, CarParameters.height)
 MAX_CARS = 12
 DESIRED_KMH = (40.0, 62.0)
 MIN_START_GAP_M = 25.0
-"""Least gap (m, bumper to bumper) between the ego car and any car at the start."""
+"""Least gap (m, bumper to bumper) between the ego car and any traffic car at the start."""
 START_RANGE_M = 600.0
-"""Cars start within this distance (m) ahead of the ego car; farther if there are many."""
+"""Traffic cars start within this distance (m) ahead of the ego car, or within a longer distance if
+there are many cars."""
 LATERAL_ACCELERATION = 3.0
 """Largest lateral acceleration (m/s2) of a car in a bend."""
 
-_PER_CAR_M = 50.0  # least length of the start range per car
+_PER_CAR_M = 50.0  # least length of the start range divided by the number of cars
 _MIN_SPACING_M = TRAFFIC_CAR_SIZE[0] + 12.0
 _CELL_M = 1.0
 
@@ -39,8 +40,8 @@ _CELL_M = 1.0
 class Traffic:
     """`count` cars on `road`. Their start is random from `rng`; their driving is deterministic.
 
-    `ego_s` is the start of the ego car (m, default: 25 m before the line). Raises UserError if the
-    road has no room for `count` cars.
+    `ego_s` is the start of the ego car (m, default: 25 m before the start line). Raises UserError
+    if the road has no room for `count` cars.
     """
 
     def __init__(
@@ -181,7 +182,8 @@ class Traffic:
         car_table.update_poses(self._cars, self._table, self._poses)
 
     def _initial_cars(self, count: int, rng: np.random.Generator, ego_s: float) -> FloatArray:
-        """Return a table of `count` random cars. Raises UserError if there is no room."""
+        """Return a table of `count` random cars ahead of `ego_s` (m), the start of the ego car.
+        Raises UserError if there is no room."""
         nearest = MIN_START_GAP_M + 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0])
         room = self._length - 2 * nearest
         lanes = len(self._lane_y)
@@ -211,8 +213,9 @@ class Traffic:
         return cars
 
     def _initial_speed(self, cars: FloatArray, gaps: FloatArray) -> FloatArray:
-        """Return start speeds (n,) in m/s that keep the speed limit and the time headway, and from
-        which each car can stop behind a leader at rest; `gaps` (n,) m."""
+        """Return start speeds (n,) in m/s of `cars`. They keep the speed limit and the time
+        headway, and from them each car can stop behind a leader at rest. `gaps` (n,) are the bumper
+        gaps (m) to the leaders."""
         cells = len(self._limit)
         cell = (cars[:, car_table.S] / self._length * cells).astype(int) % cells
         free = np.maximum(gaps - STANDSTILL_GAP_M, 0.0)
@@ -230,7 +233,8 @@ def _random_places(count: int, reach: float, rng: np.random.Generator) -> FloatA
 def _curve_speed_limits(track: Track, outermost_y: float) -> FloatArray:
     """Return speed limits (cells,) in m/s, in cells of about 1 m around the loop.
 
-    The limit is that of the innermost lane; before a bend it decreases at comfortable braking.
+    The limit is the limit of the innermost lane, whose centre is `outermost_y` (m) from the centre
+    line. Before a bend it decreases at comfortable braking.
     """
     cells = math.ceil(track.length_m / _CELL_M)
     step = track.length_m / cells

@@ -45,14 +45,14 @@ class Marking:
 
     @property
     def left_m(self) -> float:
-        """Offset, left positive, of the marking's leftmost line from the nominal position. This
-        line bounds the lane on the left. 0 if there is no line."""
+        """Offset (m, left positive) of the marking's leftmost line from the nominal position. This
+        line bounds the lane to the left of the marking. 0 if there is no line."""
         return self.lines[0].offset_m if self.lines else 0.0
 
     @property
     def right_m(self) -> float:
-        """Offset, left positive, of the marking's rightmost line from the nominal position. This
-        line bounds the lane on the right. 0 if there is no line."""
+        """Offset (m, left positive) of the marking's rightmost line from the nominal position. This
+        line bounds the lane to the right of the marking. 0 if there is no line."""
         return self.lines[-1].offset_m if self.lines else 0.0
 
 
@@ -71,8 +71,8 @@ class Carriageway:
 
     @staticmethod
     def drawn(seed: int, lanes: int, model_height_m: float = MODEL_HEIGHT_M) -> "Carriageway":
-        """Return the random road of the round with `seed`; `model_height_m` is the height of the
-        model's camera above the road."""
+        """Return the random road with `lanes` lanes of the round with `seed`. `model_height_m` is
+        the height (m) of the model's camera above the road."""
         size = draw(ranges(), "lanes", generator(seed, "lanes"))
         place = draw(ranges(), "camera", generator(seed, "camera"))["place"]
         width = round(float(size["width_m"]), 3)
@@ -102,11 +102,11 @@ class Carriageway:
 def camera_heights(
     lane_width_m: float, narrowest_m: float = math.inf, model_height_m: float = MODEL_HEIGHT_M
 ) -> tuple[float, float]:
-    """Return the least and greatest camera height (m) with which a model sees lanes 2.75 to 4.4 m
-    wide, within 0.9 to 2.2 m if possible. `model_height_m` is the height of the model's training
-    camera.
+    """Return the least and greatest height (m) of a camera in whose pictures a model sees lanes of
+    `lane_width_m` (m) as 2.75 to 4.4 m wide. The heights are within 0.9 to 2.2 m if possible.
+    `model_height_m` (m) is the height of the model's training camera.
 
-    `narrowest_m` is the width of the narrowest lane, since a double line occupies some of the
+    `narrowest_m` (m) is the width of the narrowest lane, since a double line occupies some of the
     width.
     """
     apparent_low, apparent_high = APPARENT_WIDTH_M
@@ -117,7 +117,8 @@ def camera_heights(
 
 
 def _markings(drawn: dict[str, Any], lanes: int, lane_width_m: float) -> tuple[Marking, ...]:
-    """Return the markings of a road from random values of the section [lines]."""
+    """Return the markings of a road with `lanes` lanes of `lane_width_m` (m). `drawn` contains the
+    random values of the section [lines] of ranges.toml."""
     # A lane beside a double line must not be narrower than the definitions allow.
     room = lane_width_m - LANE_WIDTH_LIMITS_M[0]
     left = _marking(drawn, "left", drawn["edge_width_m"], drawn["edge_dash_m"], 0.5)
@@ -135,9 +136,11 @@ def _marking(
     room_m: float = math.inf,
 ) -> Marking:
     """Return the marking `name` ("left", "right" or "divider"), of one of the kinds in ranges.toml.
+    `drawn` contains the random values of the section [lines], `width_m` is the width of a line, and
+    `dash` contains the lengths (m) of a dash and of a gap.
 
     `inner` shifts a double line to the left by this share of the distance between its lines. If the
-    lines are more than `room_m` apart, only the first line is used.
+    lines are more than `room_m` (m) apart, only the first line is used.
     """
     kind, colour = str(drawn[name]), str(drawn[f"{name}_colour"])
     apart = width_m + float(drawn["apart_m"])

@@ -43,8 +43,9 @@ def drawn_as(kind: type[Kind], section: str, rng: np.random.Generator) -> Kind:
 
 
 def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
-    """Return random values of the table `name`. If it has the entry `like`, the values of the table
-    that `like` names are drawn first; entries of the table itself replace them."""
+    """Return random values of the table `name` of `tables`. If the table has the entry `like`, the
+    values of the table that `like` names are drawn first; entries of the table itself replace
+    them."""
     table = tables[name]
     drawn: Values = draw(tables, table["like"], rng) if "like" in table else {}
     for entry, value in table.items():

@@ -36,14 +36,15 @@ class Surface:
     warmth: float = 0.0
     """Excess of red over blue in the asphalt's colour, as a share."""
     other_tone: float = 0.0
-    """Albedo of a second material, whose sections alternate with the first's; 0: none."""
+    """Albedo of a second material, whose sections alternate with sections of the first material; 0:
+    there is no second material."""
     section_m: float = 100.0
     """Mean length of the sections of both materials, m."""
     concrete: float = 0.0
-    """Sections made of concrete slabs: 0 none, 1 those of both materials, -1 those of the
-    second."""
+    """Sections made of concrete slabs: 0: none, 1: the sections of both materials, -1: the sections
+    of the second material."""
     joint_m: float = 5.0
-    """Distance between the joints of concrete slabs."""
+    """Distance (m) between the joints of concrete slabs."""
     halves: float = 0.0
     """Difference in tone between the two sides of a lengthwise seam, as a share."""
     seam_m: float = 0.0
@@ -88,7 +89,7 @@ class Roadside:
     bridge_every_m: float = 0.0
     """Distance between bridges over the road; 0: the distance in the track's scenery."""
     dry: float = 0.0
-    """Share of the grass that is yellow, in addition to that of the scenery."""
+    """Share of the grass that is yellow, in addition to the yellow grass of the track's scenery."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ class Lighting:
     adaptation_stops: float = 0.0
     """Stops by which the exposure has increased at the end of a bridge's shadow."""
     low_sun_deg: float = 0.0
-    """Elevation of a low sun; 0: the elevation of the kind of light."""
+    """Elevation (deg) of a low sun; 0: the elevation of the kind of light."""
     flare: float = 0.0
     """Strength of the sun's glare in the lens."""
     night: bool = False

@@ -11,8 +11,9 @@ from trackfeatures.errors import UserError
 def make_road(
     track: Track, lanes: int, lane_width_m: float | None, roads: str = ROADS[0], seed: int = 0
 ) -> Road:
-    """Make a road of the kind `roads`, one of ROADS. All values of a varied road, including its
-    lane width, are random with the seed `seed`.
+    """Make a road with `lanes` lanes on `track`, of the kind `roads`, one of ROADS. All values of a
+    varied road, including its lane width, are random with the seed `seed`. `lane_width_m` (m) is
+    for a road of the kind "paper"; None means 4.0 m.
 
     Raises UserError for an unknown kind, or for a lane width given for a varied road.
     """

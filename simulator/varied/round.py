@@ -17,7 +17,8 @@ class VariedRound:
 
     @staticmethod
     def drawn(seed: int, lanes: int, scenes: int, model_height_m: float) -> "VariedRound":
-        """Return the round with `seed`; the model's camera is `model_height_m` above the road."""
+        """Return the round with `seed`, with `lanes` lanes and `scenes` scenes. The model's camera
+        is `model_height_m` (m) above the road."""
         looks = tuple(RoadLook.drawn(seed, scene) for scene in range(scenes))
         return VariedRound(Carriageway.drawn(seed, lanes, model_height_m), looks)
 

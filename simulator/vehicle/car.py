@@ -1,10 +1,11 @@
 """The parameters of a car (SI units; body frame x forward, y left, z up).
 
 The defaults describe TORCS's car1-trb1, the car of the paper's experiments. The mass and the axle
-distances (lf, lr) are also the paper's. Two values differ from the paper. Its yaw inertia (2000 kg
-m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
+distances (lf, lr) are also the paper's. Two values differ from the paper. The paper's yaw inertia
+(2000 kg m2) and cornering stiffness (80 kN/rad per tyre) belong to the model of its controllers
 (`controllers.laws.lateral_model`). The recorded TORCS laps of this car show 1120 kg m2 and 125
-kN/rad; with the paper's values the simulated car deviates twice as far in the kink of g-track-3.
+kN/rad. With the paper's values, the simulated car's largest distance from the middle of g-track-3,
+in its kink, is twice as large.
 """
 
 import math
@@ -18,9 +19,9 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 GRAVITY = 9.81  # m/s2
-RPM = 60.0 / (2.0 * np.pi)  # rev/min per rad/s
+RPM = 60.0 / (2.0 * np.pi)  # factor from rad/s to rev/min
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-TORQUE_RPM_STEP = 1000.0  # the torque table is given at 0, 1000, 2000, ... rev/min
+TORQUE_RPM_STEP = 1000.0  # rev/min between two entries of the torque table, which starts at 0
 LOWEST_GEAR, HIGHEST_GEAR = -1, 6  # -1 reverse, 0 neutral
 
 
@@ -36,8 +37,8 @@ class CarParameters:
     fuel: float = 80.0
     """Mass of the fuel, kg; constant, at the centre of gravity."""
     inertia: tuple[float, float, float] = (477.0, 868.0, 1113.0)
-    """Moments of inertia about x (roll), y (pitch) and z (yaw), kg m2: those of a box of the car's
-    size, with TORCS's mass repartition coefficient of 0.62 on its length."""
+    """Moments of inertia about x (roll), y (pitch) and z (yaw), kg m2. They are the moments of a
+    box of the car's size, with TORCS's mass repartition coefficient of 0.62 on its length."""
     front_axle: float = 1.27
     """Distance from the centre of gravity to the front axle, lf, m."""
     rear_axle: float = 1.37

@@ -84,8 +84,9 @@ def move_steering(p: Any, angle: float, command: float, dt: float) -> float:
 
 @inlined
 def apply_brake(spin: float, brake: float, inertia: float, dt: float) -> float:
-    """Return the wheel speed (rad/s) after a brake torque `brake` (N m) has acted on `spin` for
-    `dt` s. The brake stops the wheel but never reverses it."""
+    """Return the wheel speed (rad/s) after a brake torque `brake` (N m) has acted on a wheel of
+    `inertia` (kg m2) and speed `spin` (rad/s) for `dt` s. The brake stops the wheel but never
+    reverses it."""
     lost = brake * dt / inertia
     if spin > lost:
         return spin - lost
@@ -144,7 +145,9 @@ def update_wheel_speeds(
 
 @inlined
 def add_aerodynamics(p: Any, axes: FloatArray, velocity: FloatArray, wrench: FloatArray) -> None:
-    """Add drag and the downforce of both axles, quadratic in the forward speed, to `wrench`."""
+    """Add the drag and the downforce of both axles to `wrench` (6,). They are quadratic in the
+    forward speed. `axes` (3, 3) has the body axes as rows; `velocity` (6,) is linear, then
+    angular."""
     speed = axes[0, 0] * velocity[0] + axes[0, 1] * velocity[1] + axes[0, 2] * velocity[2]
     pressure = 0.5 * p.air_density * speed * speed
     drag = pressure * (p.drag_coefficient * p.frontal_area + p.wing_drag)
@@ -164,7 +167,7 @@ def add_underbody_contact(
 ) -> None:
     """Add to `wrench` the contact force of an underbody that is `depth` m below the road with the
     unit normal `normal`. The force supports a car that lies on its underbody, side or roof, where
-    the wheels give no support."""
+    the wheels give no support. `velocity` (6,) is the body's velocity, linear, then angular."""
     if depth > 0.0:
         nx, ny, nz = normal
         closing = -(velocity[0] * nx + velocity[1] * ny + velocity[2] * nz)

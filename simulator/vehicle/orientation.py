@@ -9,7 +9,8 @@ from runtime.jit import compiled, inlined
 def quaternion(
     forward: NDArray[np.float64], left: NDArray[np.float64], up: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the unit quaternion (x, y, z, w) of the frame with these orthonormal axes, each (3,).
+    """Return the unit quaternion (x, y, z, w) of the frame with the orthonormal axes `forward`,
+    `left` and `up`, each (3,).
 
     Of four equivalent formulas, the one with the largest divisor is used (Shepperd, 1978).
     """

@@ -9,7 +9,8 @@ from simulator.vehicle.car import RPM, TORQUE_RPM_STEP
 
 @inlined
 def gear_ratio(p: Any, gear: int) -> float:
-    """Return the ratio of engine speed to rear-wheel speed: negative in reverse, 0 in neutral."""
+    """Return the ratio of engine speed to rear-wheel speed in `gear` (-1 to 6). It is negative in
+    reverse (-1) and 0 in neutral (0)."""
     if gear > 0:
         return float(p.gears[gear - 1] * p.final_drive)
     if gear < 0:
@@ -47,8 +48,8 @@ def limit_shaft_speed(p: Any, wheel_speed: float, ratio: float) -> float:
 
 @compiled
 def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float:
-    """Return the engine speed (rad/s) after `dt` s in neutral, from the engine speed `speed`
-    (rad/s)."""
+    """Return the engine speed (rad/s) after `dt` s in neutral with `throttle` (0 to 1). `speed`
+    (rad/s) is the engine speed before."""
     faster = speed + dt * engine_torque(p, speed, throttle) / p.engine_inertia
     return float(min(max(faster, p.idle_rpm / RPM), p.top_rpm / RPM))
 
@@ -56,7 +57,7 @@ def free_engine_speed(p: Any, speed: float, throttle: float, dt: float) -> float
 @inlined
 def clutch(p: Any, shaft_speed: float, throttle: float) -> tuple[float, float, float]:
     """Return the engine speed (rad/s), and torque (N m) and inertia (kg m2) of the engine at the
-    gearbox input shaft, which turns at `shaft_speed` rad/s.
+    gearbox input shaft, which turns at `shaft_speed` rad/s. `throttle` is from 0 to 1.
 
     Below idle speed the clutch slips: the engine idles and transmits its torque, but its inertia
     does not act on the shaft. Above `limiter_rpm` the engine gives no torque, neither drive nor

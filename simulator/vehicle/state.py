@@ -71,7 +71,8 @@ class CarState:
 
 
 def speed_of(vx: float, vy: float) -> float:
-    """Return the speed (m/s) in the road plane; negative if the car rolls backwards."""
+    """Return the speed (m/s) in the road plane from the velocities `vx` (forward) and `vy` (left)
+    in the body frame (m/s). It is negative if the car rolls backwards."""
     # math.hypot, because hypot of compiled code and of numpy differs in the last bits.
     planar = math.hypot(vx, vy)
     return planar if vx >= 0.0 else -planar

@@ -35,8 +35,9 @@ def slip_force_ratio(
 
 @inlined
 def peak_force(p: Any, front: bool, load: float, grip: float) -> float:
-    """Return the largest force (N) of a tyre at `load` (N) on ground with this `grip`. The friction
-    coefficient decreases with the load."""
+    """Return the largest force (N) of a front (`front`) or rear tyre at `load` (N) on ground with
+    the factor `grip` on the friction coefficient. The friction coefficient decreases with the
+    load."""
     share = load / (p.working_front if front else p.working_rear)
     span = p.friction_unloaded - p.friction_overloaded
     # The value of `friction_rate` gives the nominal friction at share 1.
@@ -49,7 +50,8 @@ def peak_force(p: Any, front: bool, load: float, grip: float) -> float:
 def tyre_slip_gain(p: Any, peak: float, along: float, across: float, spin: float) -> float:
     """Return the tyre force per m/s of slip speed (N s/m) at the current combined slip.
 
-    along, across: speed over the ground in the wheel frame (m/s); spin: wheel speed (rad/s).
+    peak: largest tyre force (N); along, across: speed over the ground in the wheel frame (m/s);
+    spin: wheel speed (rad/s).
     """
     reference = max(abs(along), MIN_SLIP_SPEED_M_S)
     slip = math.hypot(spin * p.wheel_radius - along, across) / reference

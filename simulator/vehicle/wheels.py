@@ -132,8 +132,8 @@ def set_directions(
 
 @inlined
 def spring_force(p: Any, front: bool, compression: float, other: float) -> float:
-    """Return the force (N) of a wheel's spring, anti-roll bar and bump stop at `compression` m from
-    rest; `other` (m) is the compression of the axle's other wheel."""
+    """Return the force (N) of the spring, anti-roll bar and bump stop of a front (`front`) or rear
+    wheel at `compression` m from rest; `other` (m) is the compression of the axle's other wheel."""
     force = p.load_front if front else p.load_rear
     force += (p.spring_front if front else p.spring_rear) * compression
     force += (p.anti_roll_front if front else p.anti_roll_rear) * (compression - other)
@@ -205,8 +205,9 @@ def add_tyre_forces(
 def component(
     wheels: FloatArray, wheel: int, axis: int, forward: float, leftward: float, load: float
 ) -> float:
-    """Return the component along world axis `axis` (0 to 2) of the force on a wheel, given by its
-    parts (N) `forward`, `leftward` and, along the road normal, `load`."""
+    """Return the component along world axis `axis` (0 to 2) of the force on wheel `wheel`, a row of
+    `wheels`. The force is given by its parts (N) along the wheel's directions (`forward`,
+    `leftward`) and along the road normal (`load`)."""
     ahead = wheels[wheel, FORWARD + axis] * forward
     return float(
         ahead + wheels[wheel, LEFT + axis] * leftward + wheels[wheel, NORMAL + axis] * load
@@ -223,7 +224,8 @@ def add_force(
     arm_y: float,
     arm_z: float,
 ) -> None:
-    """Add a force (N, world frame) with the arm (m) from the centre of gravity to `wrench` (6,)."""
+    """Add a force (fx, fy, fz) (N, world frame) to `wrench` (6,). Its arm (arm_x, arm_y, arm_z) (m)
+    reaches from the centre of gravity to the point where the force acts."""
     wrench[0] += fx
     wrench[1] += fy
     wrench[2] += fz

@@ -19,11 +19,11 @@ from simulator.world.pace import Pacer, Rate
 from simulator.world.world import World
 
 SHOW_S: Final = 1.0 / 26.0
-"""Least interval between updates of the browsers (s of wall-clock time)."""
+"""Least interval (s of wall-clock time) between two updates of the browsers."""
 MAX_IMAGE_AGE_S: Final = 0.25
 """Longest time for which images are skipped while the drive is late."""
 ENDED_S: Final = 2.0
-"""Time for which the end of an episode is shown before the next one begins."""
+"""Time (s) for which the end of an episode is shown before the next episode begins."""
 
 
 class Drive:
@@ -56,7 +56,8 @@ class Drive:
         self._start()
 
     def advance(self) -> None:
-        """Do one control step, publish it to the browsers, and wait until the next one is due."""
+        """Do one control step, publish the new state to the browsers, and wait until the next step
+        is due."""
         self._handle_requests()
         if self._ended_at is not None:
             if time.monotonic() - self._ended_at > ENDED_S:
@@ -70,8 +71,8 @@ class Drive:
         self._renderer.close()
 
     def _warm_up(self) -> None:
-        """Compile and build everything before a browser waits for it. This takes seconds, more with
-        an empty cache, and does not change the drive."""
+        """Compile all functions and build the scene before a browser waits for them. This takes
+        seconds, and longer with an empty cache. It does not change the drive."""
         self.world.reset(seed=self._seed)
         for command in (
             self._cruise.command(self.world.state, self.world.traffic),
@@ -144,7 +145,8 @@ class Drive:
         self._cruise.take_over()
 
     def _show(self) -> None:
-        """Publish the state, with new pictures of the views that browsers show, every SHOW_S."""
+        """Publish the state, and new pictures of the views that browsers show, once every
+        SHOW_S."""
         now = time.monotonic()
         views = [view for view in self.hub.wanted_views() if view not in self._taken]
         if now - self._last_show < SHOW_S and not (self.paused and views):

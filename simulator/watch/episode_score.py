@@ -5,8 +5,8 @@ from simulator.world.world import World
 
 
 class Score:
-    """Sums the reward over an episode. If the simulated time of a counted state is less than
-    before, a new episode has begun."""
+    """Sums the reward over an episode. A new episode has begun if the simulated time of a state is
+    less than the time of the state counted before it."""
 
     def __init__(self) -> None:
         self.episode = 0

@@ -30,8 +30,8 @@ class Snapshot:
 
 @dataclass(eq=False)
 class Browser:
-    """One connected page: the view that it shows, and the messages sent to it and answered by
-    it."""
+    """One connected page: the view that it shows, the messages sent to it, and the number of
+    messages that it has answered."""
 
     view: str
     changed: asyncio.Event = field(default_factory=asyncio.Event)

@@ -10,12 +10,12 @@ from simulator.vehicle.car import CarParameters
 from simulator.vehicle.state import CarState, Command
 
 HELD_S: Final = 0.7
-"""Time after which keys count as released unless the browser repeats them."""
-LATERAL_ACCELERATION: Final = 6.0  # m/s2 in the bend that a held key causes
+"""Time (s) after which keys count as released unless the browser sends them again."""
+LATERAL_ACCELERATION: Final = 6.0  # m/s2: largest value in the bend that a held key causes
 MAX_STEER: Final = 0.7
-STEER_RATE: Final = 2.0  # 1/s
-MAX_SPEED: Final = 45.0  # m/s
-FORWARD, BACK, COAST = 3.0, -7.0, -0.6  # m/s2
+STEER_RATE: Final = 2.0  # 1/s: largest change of the steering action (-1 to 1) per second
+MAX_SPEED: Final = 45.0  # m/s: the key "up" does not accelerate above this speed
+FORWARD, BACK, COAST = 3.0, -7.0, -0.6  # m/s2: with the key "up", with "down", without both keys
 
 
 class Keyboard:
@@ -40,7 +40,7 @@ class Keyboard:
         self._pedals.reset()
 
     def hold(self, keys: frozenset[str]) -> None:
-        """Set the keys that are held down. They count as released after 0.7 s, unless this is
+        """Set the keys that are held down. They count as released after 0.7 s, unless `hold` is
         called again."""
         self._keys, self._until = keys, self._clock() + HELD_S
 
@@ -62,7 +62,8 @@ class Keyboard:
         return Command(self._steer, throttle, brake, gear)
 
     def _reach(self, speed: float) -> float:
-        """Return the steering for a held key; LATERAL_ACCELERATION lowers it at high speed."""
+        """Return the steering (0 to MAX_STEER) for a held key at `speed` (m/s).
+        LATERAL_ACCELERATION limits it at high speed."""
         car = self._car
         wheel = LATERAL_ACCELERATION * car.wheelbase / max(speed * speed, 1.0)
         return min(wheel / car.steering_lock, MAX_STEER)

@@ -91,7 +91,8 @@ async def _send(connection: WebSocket, hub: Hub, browser: Browser) -> None:
 
 
 async def _receive(connection: WebSocket, hub: Hub, browser: Browser) -> None:
-    """Apply the browser's messages until it disconnects; the drive handles most of them."""
+    """Apply the browser's messages until the browser disconnects. Messages about the view and
+    received pictures are handled here; all other messages are passed to the drive."""
     while True:
         try:
             request = parse(await connection.receive_text())

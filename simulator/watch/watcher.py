@@ -17,7 +17,7 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 SHOW_S: Final = 1.0 / 20.0
-"""Least interval between updates of the browsers (s of wall-clock time)."""
+"""Least interval (s of wall-clock time) between two updates of the browsers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,8 @@ class Watcher:
             self._pacer = Pacer(1.0 / world.frequency_hz, self._speed)
 
     def _handle_requests(self) -> None:
-        """Handle requests for another light; ignore others, which would change the drive."""
+        """Handle requests for another light. Ignore all other requests, because they would change
+        the drive."""
         requests, _ = self._hub.take_requests()
         for _, request in requests:
             if request.kind == "light" and self._renderer is not None:

@@ -15,12 +15,14 @@ from simulator.vehicle.orientation import rotation
 
 CENTRE, AXES, HALF, BOX = 0, 3, 12, 15
 GROUND_CLEARANCE_M = 0.12
-"""Distance from the road to the underside of a car's box."""
+"""Distance (m) from the road to the underside of a car's box."""
 
 
 @compiled
 def box_height(height: float, cg_height: float) -> tuple[float, float]:
-    """Return half the height of a car's box, and its centre's height over the CG, in m."""
+    """Return half the height of a car's box, and the height of the box's centre over the centre of
+    gravity, in m. `height` is the car's height, `cg_height` the height of its centre of gravity, in
+    m."""
     half = 0.5 * (height - GROUND_CLEARANCE_M)
     return half, GROUND_CLEARANCE_M + half - cg_height
 

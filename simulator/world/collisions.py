@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from simulator.world.physics import PhysicsClient
 
 CONTACT_MARGIN_M = 0.02
-"""PyBullet's contact threshold; bodies with a larger gap have no effect on each other."""
+"""PyBullet's contact threshold (m). Bodies with a larger gap have no effect on each other."""
 STEP_MARGIN_M = 1.0
 """Upper bound on the distance (m) that two bodies approach each other in one physics step. Bodies
-within it take part in the step."""
+within this distance take part in the step."""
 
 
 class ContactPhysics:
@@ -121,7 +121,9 @@ class ContactPhysics:
         memory: FloatArray,
         wrench: FloatArray,
     ) -> None:
-        """Pass a car's motion, the wrench on it and the wall panel beside it to PyBullet."""
+        """Pass the motion of the car with index `index`, the `wrench` on it and the wall panel
+        beside it to PyBullet. `memory` (8,) is the car's internal state, which contains its piece
+        of the track."""
         physics.set_motion(physics.cars[index], motion)
         physics.apply_wrench(physics.cars[index], wrench, motion)
         _, s, d = locate(self._table, motion[0], motion[1], int(memory[PIECE]))
@@ -134,7 +136,9 @@ class ContactPhysics:
     def _select_nearby(
         self, physics: "PhysicsClient", motion: FloatArray, places: FloatArray
     ) -> None:
-        """Select the traffic for the next step: moving wrecks, cars near them or the ego car."""
+        """Select the traffic cars that take part in the next step: moving wrecks, and cars near a
+        moving wreck or near the ego car with `motion` (13,). `places` (n, 2 or more) are the
+        positions (m) of all traffic cars."""
         moving = [row for row, wreck in self._wrecks.items() if wreck.moving]
         centres = [motion[:2], *(self._wrecks[row].motion[:2] for row in moving)]
         near = set(moving)

@@ -9,13 +9,13 @@ from trackfeatures.errors import UserError
 
 SPEEDS: Final = (0.05, 100.0)
 MAX_CATCH_UP_S: Final = 0.25
-"""Longest delay (s) of a watched drive that later steps make up; longer delays remain."""
+"""Longest delay (s) of a watched drive that later steps make up. Longer delays are not made up."""
 WINDOW_S: Final = 1.5
 """Length of the time window (s) in which a rate is measured."""
 
 
 def check_speed(speed: float) -> None:
-    """Raises UserError for a speed (times real time) out of range."""
+    """Raises UserError unless `speed`, a multiple of real time, is in its range."""
     if not SPEEDS[0] <= speed <= SPEEDS[1]:
         raise UserError(
             f"a speed of {speed:g} times real time was asked for; it must be "
@@ -41,8 +41,8 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """Amount per second; 0 if fewer than two amounts were added, or if the window began over 3
-        s ago."""
+        """Amount per second; 0 if the window contains fewer than two amounts, or if its oldest
+        amount was added 3 s ago or earlier."""
         if len(self._marks) < 2:
             return 0.0
         first, before = self._marks[0]

@@ -19,10 +19,10 @@ from simulator.world.control_rate import PHYSICS_HZ
 from simulator.world.walls import PANEL, Panel
 from trackfeatures.errors import UserError
 
-CONTACT_FRICTION = 0.3  # of car bodies on walls and on each other
+CONTACT_FRICTION = 0.3  # friction coefficient of car bodies on walls and on each other
 RESTITUTION = 0.1
 SOLVER_ITERATIONS = 20
-PARKING_DEPTH_M = 1_000.0  # below the road, where a body not in use is out of contact
+PARKING_DEPTH_M = 1_000.0  # depth below the road at which unused bodies are out of contact
 
 Motion = NDArray[np.float64]
 

@@ -19,9 +19,9 @@ from simulator.track.road import Road
 from simulator.world.boxes import AXES, CENTRE, HALF
 
 PANEL = (6.0, 3.0, 8.0)
-"""Length, thickness and height of a panel."""
+"""Length, thickness and height (m) of a panel."""
 FOOT_M = 3.0  # depth of the panel below the road
-FAR_ALONG_M = 60.0  # parts of the track farther apart along s count as different roads
+FAR_ALONG_M = 60.0  # parts of the track farther apart than this along s count as separate parts
 MIN_BRIDGE_HEIGHT_M = 4.0  # least height of one road above the other at a bridge
 _STEP_M = 1.0
 _CENTRE_STEP_M = 2.0
@@ -133,7 +133,8 @@ def _wall_present(road: Road, stations: NDArray[Any], side: int) -> NDArray[np.b
 def _on_another_road(
     road: Road, stations: NDArray[np.float64], foot: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return whether each wall foot (N, 3) is within the edge of a part of the track far along."""
+    """Return whether each wall foot (N, 3) at s = `stations` (N,) m lies on another part of the
+    track, that is, within the road's edge at a place more than 60 m away along the lap."""
     centre = road.track.at(np.arange(0.0, road.track.length_m, _CENTRE_STEP_M))
     points = np.column_stack((centre.x, centre.y, centre.z))
     return covered_elsewhere(stations, foot, points, road.track.length_m, road.edge)
@@ -156,8 +157,8 @@ def covered_elsewhere(
         while k < centre.shape[0]:
             apart = math.hypot(foot[i, 0] - centre[k, 0], foot[i, 1] - centre[k, 1])
             if apart >= edge:
-                # Skip the points that cannot lie within the edge: a distance along the line is
-                # never less than the straight distance.
+                # Skip the points of the centre line that cannot be within `edge` of the foot: the
+                # distance along the line between two points is never less than the straight one.
                 k += max(int((apart - edge) / _CENTRE_STEP_M), 1)
                 continue
             along = abs(stations[i] - k * _CENTRE_STEP_M)

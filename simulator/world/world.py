@@ -69,12 +69,12 @@ from trackfeatures.errors import UserError
 __all__ = ["CarState", "Command", "World"]
 
 BACKWARDS_SPEED_M_S = -0.5
-"""Below this speed along the track, the car counts as driving backwards."""
+"""Below this speed (m/s) along the track, the car counts as driving backwards."""
 MAX_START_SPEED_M_S = 150.0
 
 
 class World:
-    """A simulated car with its surroundings; `reset` starts an episode, `step` advances
+    """A simulated car with its surroundings; `reset` starts an episode, `step` advances it by
     1/frequency_hz s.
 
     The ego car is car `number` of `fleet`, by default of its own fleet. A caller that steps a whole
@@ -130,8 +130,8 @@ class World:
         angle: float = 0.0,
         speed: float = 0.0,
     ) -> CarState:
-        """Start an episode. `s` (m) defaults to 25 m before the line; `angle` is track tangent
-        minus yaw (rad, positive if the car points to the right); `speed` is in m/s along the body.
+        """Start an episode. `s` (m) defaults to 25 m before the start line; `angle` is track
+        tangent minus yaw (rad, positive if the car points right); `speed` (m/s) is along the body.
 
         The episode depends only on the arguments, not on earlier episodes. Raises UserError for a
         value out of range.
@@ -208,7 +208,7 @@ class World:
         self.close()
 
     def _place(self, s: float, to_middle: float, angle: float, speed: float) -> None:
-        """Place the car on its wheels at (s, to_middle) m, rolling at `speed` m/s."""
+        """Place the car on its wheels at (s, to_middle) m, `angle` rad, rolling at `speed` m/s."""
         piece = index_at(self._table, s)
         wrapped = s % self.road.track.length_m
         pose = self.road.track.at(s, to_middle)
@@ -241,8 +241,8 @@ class World:
         self._fleet.move[self._number, : len(old)] = move
 
     def _advance_in_contact(self) -> None:
-        """Do the rest of a control step: PyBullet computes contacts, compiled code the motion
-        between them. Stores what the car touched first."""
+        """Do the rest of a control step: PyBullet computes contacts, compiled code computes the
+        motion between contacts. Stores what the car touched first."""
         steps, done = PHYSICS_HZ // self.frequency_hz, int(self._row[DONE])
         others = self._fleet.others[self._number, : self._traffic_count]
         move = self._fleet.move[self._number, : self._traffic_count]

@@ -18,12 +18,13 @@ from simulator.camera.scene.themes import Theme
 
 CLEARANCE_M = 5.4
 HEADROOM_M = 2.5
-"""Least clearance at the wall line; the sides of an arch are lower than its middle."""
+"""Least height (m) above the road of the parts of a bridge that reach inside the wall lines. It is
+less than CLEARANCE_M, because the sides of an arch are lower than its middle."""
 APART_M = 140.0
 KEEP_FREE_M = 3.0
-"""Least distance of trees and props from a bridge's footprint."""
+"""Least distance (m) of trees and props from a bridge's footprint."""
 DEEPEST_M = 7.0
-"""No bridge is built where the terrain at its ends lies deeper than this below the road."""
+"""No bridge is built where the terrain at its ends lies deeper than this (m) below the road."""
 TRIES = 12
 
 
@@ -44,11 +45,13 @@ class Bridge:
     half_across: float
 
     def inside(self, points: FloatArray) -> FloatArray:
-        """Return world points (..., 3), m, in the bridge's frame, in the same shape."""
+        """Convert `points` (..., 3), m, from the world frame to the bridge's frame, in the same
+        shape."""
         return self.turned(points - self.place)
 
     def turned(self, direction: FloatArray) -> FloatArray:
-        """Return world directions (..., 3) rotated into the bridge's frame, in the same shape."""
+        """Rotate directions (..., 3) from the world frame into the bridge's frame, in the same
+        shape."""
         return np.asarray(direction @ _turn(self.heading))
 
     def near(self, x: FloatArray, y: FloatArray, margin_m: float | FloatArray) -> NDArray[np.bool_]:
@@ -60,8 +63,8 @@ class Bridge:
 
 
 def _turn(heading: float) -> FloatArray:
-    """Return the rotation matrix T (3, 3) of a bridge: T @ column converts directions from the
-    bridge's frame to the world, row @ T converts them back."""
+    """Return the rotation matrix T (3, 3) of a bridge with the direction `heading` (rad). T @
+    column converts a direction from the bridge's frame to the world, row @ T converts it back."""
     cos, sin = np.cos(heading), np.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -104,9 +107,10 @@ def build(ground: Ground, theme: Theme, rng: np.random.Generator) -> tuple[Bridg
 
 
 def _clear_of_the_road(ground: Ground, points: FloatArray, z: float) -> bool:
-    """Return whether all parts of a bridge lower than HEADROOM_M above the road height `z` lie
-    outside the wall lines of every part of the track. In a bend, an embankment can reach inside
-    them. `points` (n, 3): corners of its triangles, world, m."""
+    """Return whether a bridge leaves room for traffic: all its parts that are less than HEADROOM_M
+    above the road height `z` (m) must lie outside the wall lines of every part of the track. The
+    test is needed because in a bend an embankment can reach inside the wall lines. `points` (n, 3),
+    m, world, are the corners of the bridge's triangles."""
     corners = points.reshape(-1, 3, 3)
     edges = (corners + np.roll(corners, 1, axis=1)) / 2.0
     every = np.concatenate([points, edges.reshape(-1, 3)])

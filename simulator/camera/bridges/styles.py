@@ -100,7 +100,7 @@ class BridgeBuilder:
 
 
 Style = Callable[[BridgeBuilder, np.random.Generator], None]
-"""A function that adds the parts of one bridge to the builder."""
+"""A function that adds the parts of one bridge to the builder, with random sizes and colours."""
 
 
 def half_span(style: str, wall: float) -> float:
@@ -116,7 +116,8 @@ def _pick(rng: np.random.Generator, colours: tuple[Point, ...]) -> Point:
 def _railing(
     builder: BridgeBuilder, x: float, reach: float, foot: float, colour: Point, step: float
 ) -> None:
-    """Add posts, `step` m apart, and two bars across the road at `x`, from -`reach` to `reach`."""
+    """Add a railing across the road at `x` (m): two bars from -`reach` to `reach` (m), and posts,
+    `step` (m) apart. `foot` (m) is the height of the foot of the posts, `colour` is linear RGB."""
     for height in (0.5, 1.02):
         builder.box_without_shadow((0.06, 2 * reach, 0.06), (x, 0.0, foot + height), colour)
     for y in np.arange(-reach, reach + 0.01, step):
@@ -124,7 +125,9 @@ def _railing(
 
 
 def _mounds(builder: BridgeBuilder, width: float, reach: float, top: float, ground: float) -> None:
-    """Add the embankments that lead to both ends of a deck."""
+    """Add the embankments that lead to both ends of a deck. `width` (m) is the width of the deck,
+    `reach` (m) the lateral distance of its ends, `top` (m) the height of its surface, and `ground`
+    (m) the height of the lowest terrain."""
     low, spread = ground - 1.0, 1.4 * (top - ground)
     for side in (-1.0, 1.0):
         crest = _ring(width / 2 + 0.3, side * (reach - 0.6), side * (reach + 5.0), top)
@@ -205,7 +208,8 @@ def adverts(builder: BridgeBuilder, rng: np.random.Generator) -> None:
 
 
 def _walkway(builder: BridgeBuilder, style: str, colour: Point) -> None:
-    """Add a deck of 2.6 m width with railings, columns and stairs, as `style`."""
+    """Add a deck of 2.6 m width with railings, columns and stairs. `style`, a key of STYLES,
+    determines its length; `colour` is linear RGB."""
     wall, under, ground = builder.wall, builder.under, builder.ground
     width, reach = 2.6, half_span(style, wall)
     builder.box((width, 2 * reach, 0.38), (0.0, 0.0, under), colour)
@@ -220,7 +224,9 @@ def _walkway(builder: BridgeBuilder, style: str, colour: Point) -> None:
 
 
 def _stairs(builder: BridgeBuilder, y: float, top: float, ground: float, colour: Point) -> None:
-    """Add stairs that descend along the road from the deck's edge at lateral offset `y`."""
+    """Add stairs that descend along the road from the deck's edge at the lateral offset `y` (m).
+    They begin at the height `top` (m) and end at the height `ground` (m). `colour` is linear
+    RGB."""
     steps = max(4, round((top - ground) / 0.5))
     for k in range(steps):
         z = top - (k + 1) * (top - ground) / steps
@@ -282,7 +288,9 @@ def _arch_part(
     top: float,
     colour: Point,
 ) -> None:
-    """Add the part of the arch's vault and side walls between two points (y, z) of its curve."""
+    """Add one part of an arch, of `width` m: the vault and the side walls between two points of the
+    arch's curve. `y` (m) and `z` (m) are the lateral offsets and the heights of the two points,
+    `top` (m) is the height of the walls' upper edge, `colour` is linear RGB."""
     for x, turn in ((-width / 2, -1), (width / 2, 1)):
         near, far = (y[0], z[0]), (y[1], z[1])
         if turn < 0:

@@ -33,9 +33,9 @@ MAX_SIZE = 4096
 DRIVER_CAMERA = CameraParameters()
 _OWN_PAINT = 0
 PARKED_REACH_M = 110.0
-"""Distance from the camera beyond which parked cars are not drawn."""
+"""Distance (m) from the camera beyond which parked cars are not drawn."""
 HEADLIGHT_AT = (2.1, 0.0, 0.4)
-"""Position of one light source that replaces both headlights, in the body frame, metres."""
+"""Position, in the body frame in m, of the one light source that replaces both headlights."""
 
 
 def check_size(width: int, height: int) -> None:
@@ -75,8 +75,8 @@ class Camera:
     """A camera on a car that draws one scene of `road`: the random scenery of `seed` under `light`.
     `look` is the random paint, surface and roadside of `--roads varied`; None for `--roads paper`.
 
-    Up to `scenes` scenes stay in graphics memory, the last ones used. All cameras of a process
-    share one OpenGL context (see `context`). Any thread may use them, but only one draws at a time.
+    The `scenes` scenes used last stay in graphics memory. All cameras of a process share one OpenGL
+    context (see `context`). Any thread may use them, but only one thread draws at a time.
     The same road, seed, light, look, pose and cars give the same bytes on the same renderer. Raises
     UserError for a picture size out of range, NoRendererError without EGL, and ForkedRendererError
     in a process that was forked from a process with a camera.
@@ -114,7 +114,7 @@ class Camera:
         return self._loaded.light
 
     def change_scene(self, seed: int, light: Light, look: RoadLook | None = None) -> None:
-        """Draw another scene of the road from now on, given by `seed`, `light` and `look`."""
+        """From now on draw the scene of the road that `seed`, `light` and `look` determine."""
         with self._graphics.turns:
             self._current = None
             found = self._cache.pop((seed, light, look), None)
@@ -172,7 +172,7 @@ class Camera:
         "VIEW:class" the index into CLASSES (height, width) uint8. Depth and class show the surface
         at the pixel's centre, without leaves and hedges less than half opaque. `near_s` is the
         car's approximate position (m) along the road, to distinguish a bridge from the road below
-        it; None means as in the last picture. Raises UserError for other names.
+        it; None means the position in the last picture. Raises UserError for an unknown name.
         """
         if near_s is not None:
             self._last_s = near_s

@@ -44,7 +44,7 @@ PROGRAMS = (
 )
 FRAME_BINDING, SCENE_BINDING, LOOK_BINDING = 0, 1, 2
 VERTEX_SHADERS = {"paved": "road", "verge": "road"}
-"""Programs that use the vertex shader of another program, and the name of that program."""
+"""Programs without a vertex shader of their own, each with the program whose shader it uses."""
 LIBRARIES = ("output.glsl", "weather.glsl", "road.glsl", "sea.glsl")
 """Shader files with functions that fragment shaders call."""
 BLOCKS = {"Frame": FRAME_BINDING, "Scene": SCENE_BINDING, "Look": LOOK_BINDING}
@@ -167,11 +167,13 @@ class Graphics:
         return program
 
     def texture(self, texels: NDArray[np.uint8]) -> "moderngl.Texture":
-        """Create a texture with mipmaps from `texels`, (rows, columns[, components])."""
+        """Create a texture with mipmaps from `texels`, (rows, columns) or (rows, columns,
+        components)."""
         components = texels.shape[2] if texels.ndim == 3 else 1
         texture = self.context.texture(texels.shape[1::-1], components, texels.tobytes())
         texture.build_mipmaps()
-        # Reading only the nearest mipmap level saves 1 ms a frame; noise hides the steps.
+        # Reading only the nearest mipmap level saves 1 ms per frame. Noise in the textures hides
+        # the steps between the levels.
         texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
         return texture
 
@@ -289,7 +291,7 @@ def _filtered(rng: np.random.Generator, power: float) -> NDArray[np.float64]:
 
 
 def _levelled(field: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Replace each value by its rank, scaled to 0 to 1."""
+    """Replace each value of `field` by its rank, scaled to 0 to 1."""
     rank = np.empty(field.size)
     rank[np.argsort(field, axis=None, kind="stable")] = np.linspace(0.0, 1.0, field.size)
     return rank.reshape(field.shape)

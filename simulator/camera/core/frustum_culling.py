@@ -78,7 +78,8 @@ def visible_spheres(
 
 @compiled
 def _intersects(x: float, y: float, z: float, radius: float, planes: FloatArray) -> bool:
-    """Return whether a sphere at (x, y, z), relative to the eye, is inside all side planes."""
+    """Return whether a part of a sphere lies inside all side planes. The centre (`x`, `y`, `z`) is
+    relative to the eye; all lengths are in m. `planes` (4, 3) are the inward normals."""
     inside = True
     for plane in planes:
         inside &= x * plane[0] + y * plane[1] + z * plane[2] > -radius

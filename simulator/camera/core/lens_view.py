@@ -15,12 +15,15 @@ from simulator.camera.core.render_modes import CLASSES
 from trackfeatures.camera import CameraParameters
 
 MAX_ANGLE_DEG = 72.0
-"""Largest angle from the optical axis that one pinhole view covers; the rest is black."""
+"""Largest angle (deg) from the optical axis that one pinhole view covers. Pixels of the lens beyond
+this angle are black."""
 SHARPNESS = 1.5
-"""Drawn pixels per pixel of the picture, in each direction, where the lens magnifies most."""
-SAMPLES = 2  # points per pixel and direction, averaged, because a lens shrinks parts of the view
+"""Drawn pixels per pixel of the lens's picture, in each direction, where the lens magnifies
+most."""
+# Each pixel is the mean of SAMPLES x SAMPLES points, because a lens shrinks parts of the view.
+SAMPLES = 2
 MARGIN_PX = 2.0
-_OUTSIDE = -1e4  # px; lies outside every view
+_OUTSIDE = -1e4  # px: coordinate of points outside every view
 
 Picture = NDArray[Any]
 

@@ -27,8 +27,8 @@ class Surface:
 
 @dataclass(frozen=True)
 class Chunks:
-    """Parts of a mesh. Each is culled as a whole, by the sphere round its bounding box. `low` and
-    `high` (N, 3), m, are the least and greatest corners of the boxes. `first` and `count`
+    """Parts of a mesh. Each part is culled as a whole, by the sphere round its bounding box. `low`
+    and `high` (N, 3), m, are the least and greatest corners of the boxes. `first` and `count`
     (levels, N) are the first index and the number of indices of each part at each level of detail,
     finest first. Level k is drawn up to `reaches[k]` (m) from the eye."""
 
@@ -84,8 +84,9 @@ def vertex_arrays(
     indices: "moderngl.Buffer | None",
     layout: Sequence[str],
 ) -> "tuple[moderngl.VertexArray, moderngl.VertexArray]":
-    """Create two vertex arrays over the same vertices: the first draws colours, the second depth
-    and class. Vertex attributes that a program does not use are skipped."""
+    """Create two vertex arrays over the same `vertices` and `indices`: the first draws colours, the
+    second depth and class. `layout` is moderngl's vertex format, followed by the names of the
+    attributes. Attributes that `program` does not use are skipped."""
     drawn, labelled = (
         graphics.context.vertex_array(
             graphics.programs[name],

@@ -61,7 +61,7 @@ def eye_of(camera: CameraParameters, body_pose: ArrayLike, view: str) -> Eye:
     pose = np.asarray(body_pose, dtype=np.float64)
     yaw = float(pose[5])
     if view == "chase":
-        # This view is behind the car and has no roll.
+        # The view `chase` follows the car's yaw, but not its roll.
         turn = rotation(0.0, math.radians(_CHASE_PITCH_DEG), yaw)
         back = rotation(0.0, float(pose[4]), yaw) @ np.array([-_CHASE_BACK_M, 0.0, 0.0])
         return _eye(pose[:3] + back + np.array([0.0, 0.0, _CHASE_UP_M]), turn)
@@ -86,8 +86,9 @@ def _eye(place: FloatArray, turn: FloatArray) -> Eye:
 
 
 def extrinsics(camera: CameraParameters, body_pose: ArrayLike, view: str) -> FloatArray:
-    """Return the matrix (4, 4) from body to camera frame (x right, y down, z ahead, m) of
-    `view`."""
+    """Return the matrix (4, 4) from the body frame to the camera frame (x right, y down, z ahead,
+    m) of `view`. `body_pose` (6,) matters only for the views `chase` and `top`, which stay
+    level."""
     pose = np.asarray(body_pose, dtype=np.float64)
     eye = eye_of(camera, pose, view)
     right, up, ahead = eye.axes
@@ -112,8 +113,9 @@ def project(eye: Eye, camera: CameraParameters, points: ArrayLike) -> tuple[Floa
 def _pixels(
     points: FloatArray, eye: FloatArray, axes: FloatArray, matrix: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Project without distortion in a compiled loop, faster than numpy for a few hundred points.
-    `axes` (3, 3) as in `Eye`; `matrix` (3, 3): intrinsics."""
+    """Project world `points` (N, 3), m, to pixels, without distortion, in a compiled loop, which is
+    faster than numpy for a few hundred points. `eye` (3,), m, is the viewpoint; `axes` (3, 3) as in
+    `Eye`; `matrix` (3, 3) are the intrinsics."""
     pixels, depth = np.empty((len(points), 2)), np.empty(len(points))
     for k in range(len(points)):
         x, y, z = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]

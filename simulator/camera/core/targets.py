@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import moderngl
 
 GPU_SAMPLES = 4
-"""Samples per pixel on a GPU. On llvmpipe it is one: four samples took 24 ms a frame instead of 6
-ms, and the shaders antialias road and paint in any case."""
+"""Samples per pixel on a GPU. On llvmpipe there is one sample per pixel, because four samples took
+24 ms per frame instead of 6 ms, and the shaders antialias road and paint in any case."""
 _KEPT = 16
 _SKY = float(CLASSES.index("sky"))
 
@@ -29,8 +29,8 @@ class Target:
     resolved: "moderngl.Framebuffer"
 
     def clear(self, labels: bool) -> None:
-        """Bind the framebuffer and clear it, to infinite depth and class "sky" if `labels`, else to
-        0."""
+        """Bind the framebuffer and clear it. If `labels` is true, it is cleared to infinite depth
+        and the class "sky", otherwise to 0."""
         self.drawn.use()
         if labels:
             self.drawn.clear(np.inf, _SKY)

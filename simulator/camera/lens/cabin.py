@@ -79,7 +79,8 @@ def bonnet_edge(cabin: Cabin, width: int, height: int) -> FloatArray:
 def _bonnet(
     cabin: Cabin, light: Light, scene: FloatArray, width: int, height: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the opacity (H, W) of the bonnet, 0 to 1, and its colour (H, W, 3) in linear light."""
+    """Return the opacity (H, W) of the bonnet, 0 to 1, and its colour (H, W, 3) in linear light.
+    `scene` (3,) is the result of `surrounding_light`."""
     if cabin.bonnet == 0.0:
         return np.zeros((height, width)), np.zeros((height, width, 3))
     edge = bonnet_edge(cabin, width, height)
@@ -131,7 +132,8 @@ def _reflections(width: int, height: int, rng: np.random.Generator) -> FloatArra
 def _field(
     width: int, height: int, sigma_u: float, sigma_v: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return smooth noise (H, W) with standard deviation 1; the sigmas of the blur are in px."""
+    """Return smooth noise (H, W) with standard deviation 1. `sigma_u` and `sigma_v` (px) are the
+    standard deviations of the blur along a row and along a column."""
     noise = rng.standard_normal((height, width)).astype(np.float32)
     field = cv2.GaussianBlur(noise, (0, 0), sigma_u, sigmaY=sigma_v)
     return np.asarray(field / max(float(field.std()), 1e-9), dtype=np.float64)

@@ -107,7 +107,8 @@ def _exposed_row(
 
 @compiled
 def _add_glare(light: Plane, v: int, glare: tuple[float, float, float]) -> None:
-    """Add the sunlight that the lens scatters round the sun to row `v` of linear light (3 W,)."""
+    """Add the sunlight that the lens scatters round the sun to row `v` of linear light (3 W,).
+    `glare` contains u, v (px) of the sun and the strength of the glare."""
     width = len(light) // 3
     sun_u, sun_v, strength = glare
     narrow, wide = np.float32(0.04 * width) ** 2, np.float32(0.3 * width) ** 2

@@ -21,8 +21,8 @@ Picture = NDArray[np.uint8]
 STAGES = 3
 """Number of stages in which drops accumulate between two strokes of the wiper."""
 SMALL = 4
-"""Factor by which the picture seen through drops is reduced; drops show it so small that this
-resolution is sufficient."""
+"""Factor by which the picture seen through drops is reduced. Drops show the picture much smaller,
+so the reduced resolution is sufficient."""
 SWEEP = 0.3
 """Duration of the wiper's stroke as a share of its period."""
 MOST_DROPS = 400
@@ -69,7 +69,8 @@ class Windscreen:
         return wet
 
     def _wipe(self, picture: Picture, share: float) -> None:
-        """Draw the wiper's blade over `picture` at `share` (0 to 1) of its way there and back."""
+        """Draw the wiper's blade over `picture`, in place. `share` (0 to 1) is the completed part
+        of a stroke, which consists of the way there and the way back."""
         width, height = self._size
         angle = math.radians(-85.0 + 170.0 * (1.0 - abs(2.0 * share - 1.0)))
         reach = 1.15 * height
@@ -91,12 +92,15 @@ class Windscreen:
 
 
 def _small(size: tuple[int, int]) -> tuple[int, int]:
-    """Return width and height of the small picture, px."""
+    """Return width and height (px) of the reduced picture that drops show, for a picture of `size`
+    (width, height), px."""
     return -(-size[0] // SMALL), -(-size[1] // SMALL)
 
 
 def _fallen(cover: float, share: float, size: tuple[int, int], rng: np.random.Generator) -> _Drops:
-    """Return the first part, `share` (0 to 1), of random drops that cover `cover` of a picture."""
+    """Return the drops that have fallen when the share `share` (0 to 1) of a random sequence of
+    drops has fallen. The whole sequence covers the share `cover` of a picture of `size` (width,
+    height), px."""
     width, height = size
     scale = width / REFERENCE_WIDTH
     radius = np.clip(np.exp(rng.normal(0.7, 0.45, MOST_DROPS)), 1.1, 9.0) * scale
@@ -147,7 +151,8 @@ def _through(
     source: NDArray[np.int32],
     cover: Picture,
 ) -> Picture:
-    """Return a copy of `picture` with the drops drawn into it; for the arguments see `_Drops`."""
+    """Return a copy of `picture` with the drops drawn into it. `small` is the reduced picture that
+    drops show; `pixel`, `source` and `cover` are the fields of `_Drops`."""
     out = picture.copy()
     flat, seen = out.reshape(-1, 3), small.reshape(-1, 3)
     for k in range(len(pixel)):

@@ -106,7 +106,8 @@ class Imaging:
 
 
 def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float, float, float]:
-    """Return `develop`'s argument `motion` for a car that drives `travel_m` in the exposure."""
+    """Return `develop`'s argument `motion` for a car that drives `travel_m` (m) during the
+    exposure."""
     matrix = camera.intrinsics()
     ahead = optics.extrinsics(camera, np.zeros(6), "front")[:3, 0]
     u, v, _ = matrix @ ahead / ahead[2]
@@ -114,8 +115,9 @@ def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float,
 
 
 def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> float:
-    """Return the stops by which the exposure is increased at `s` (m): up to `stops` below a bridge,
-    falling to 0 behind it. `decks`: position along the road and half length of each deck (m)."""
+    """Return the number of stops by which the exposure is increased at `s` (m) along the road.
+    Below a bridge it rises to at most `stops`, behind the bridge it falls to 0. `decks` contains
+    the position along the road and half the length of each deck (m)."""
     most = 0.0
     for place, half in decks:
         into = min(s - (place - half), 2.0 * half)
@@ -150,7 +152,8 @@ def _seed_of(eye: Eye) -> int:
 
 
 def _compressed(picture: Picture, quality: int) -> Picture:
-    """Return the picture after JPEG compression with 4:2:0 chroma subsampling."""
+    """Return the picture after JPEG compression of `quality` (1 to 100) with 4:2:0 chroma
+    subsampling."""
     bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:

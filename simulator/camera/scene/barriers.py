@@ -65,7 +65,8 @@ def build(
 def _sections(
     s: FloatArray, length: float, kinds: tuple[str, ...], rng: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Return the kind (R,) of barrier at each row of the road mesh, as indices into KINDS."""
+    """Return the kind (R,) of barrier at each row of the road mesh, as indices into KINDS. The rows
+    are at `s` (R,), m, on a track of `length` m. Each section has a random kind out of `kinds`."""
     count = int(length / SECTION_M[0]) + 2
     ends = np.cumsum(rng.uniform(*SECTION_M, count))
     choice = rng.choice(np.array([KINDS.index(kind) for kind in kinds]), count)
@@ -79,8 +80,9 @@ def _one_side(
     column: int,
     build: tuple[NDArray[np.intp], FloatArray],
 ) -> NDArray[np.float32]:
-    """Return the vertices (R, 3, 9) of one side: foot, upper edge, and far edge of the top. `build`
-    is kind (R,) and height (R,) in m; `column` is the wall line's column of the mesh."""
+    """Return the vertices (R, 3, 9) of one side (`side` 1 left, -1 right): foot, upper edge, and
+    far edge of the top. `build` contains the kind (R,) of the barrier and its height (R,) in m;
+    `column` is the wall line's column of the mesh."""
     kind, height = build
     foot = mesh.points[:, column].copy()
     heading = road.track.at(mesh.s).heading

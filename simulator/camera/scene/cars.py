@@ -80,7 +80,9 @@ def _face(points: Sequence[Point], colour: Point) -> FloatArray:
 
 
 def _hull(outline: tuple[Point, ...], floor: float, top: Point, flank: Point) -> list[FloatArray]:
-    """Build a prism from `outline` (x, z, half width), rear to front, down to z = `floor`."""
+    """Build a prism below `outline`, points (x, z, half width) in m from rear to front. It extends
+    down to z = `floor` (m). `top` is the colour of its top, rear and front, `flank` of its
+    sides."""
     parts = []
     for (x0, z0, w0), (x1, z1, w1) in pairwise(outline):
         parts.append(_face([(x0, w0, z0), (x0, -w0, z0), (x1, -w1, z1), (x1, w1, z1)], top))
@@ -118,7 +120,8 @@ def _cabin() -> list[FloatArray]:
 
 
 def _wheel(x: float, side: float) -> list[FloatArray]:
-    """Build a wheel at `x`: a tyre with ten faces and a rim, projecting from the flank."""
+    """Build a wheel at `x` (m) on one side (`side` 1 left, -1 right): a tyre with ten faces and a
+    rim, projecting from the flank."""
     parts = []
     outer, inner = side * 0.91, side * 0.68
     angles = np.linspace(0.0, 2.0 * np.pi, 11)
@@ -145,7 +148,8 @@ def _wheel(x: float, side: float) -> list[FloatArray]:
 
 
 def _far_wheel(x: float, side: float) -> list[FloatArray]:
-    """Build a wheel at `x` as one dark face with six corners."""
+    """Build a wheel at `x` (m) on one side (`side` 1 left, -1 right) as one dark face with six
+    corners."""
     y = side * 0.91
     ring = [
         (x + _WHEEL_RADIUS * np.cos(t), y, _WHEEL_RADIUS * (1.0 + np.sin(t)))
@@ -234,7 +238,8 @@ def shared_cars(graphics: Graphics, *features: str) -> Cars:
 
 
 def _model_matrix(pose: FloatArray, eye: FloatArray) -> NDArray[np.float32]:
-    """Return the matrix (4, 4) from car frame to eye-relative world, column-major for OpenGL."""
+    """Return the matrix (4, 4) from the frame of the car at `pose` (6,) to the world frame shifted
+    to the eye, column-major for OpenGL."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation(float(pose[3]), float(pose[4]), float(pose[5]))
     matrix[:3, 3] = pose[:3] - eye

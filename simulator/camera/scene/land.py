@@ -20,7 +20,9 @@ BLOCK = 4
 SMOOTH_M = 9.0
 MOST_SHADE = 0.8
 CANOPY, CANOPY_M = 0.55, 30.0
-"""In the heavy-shadow light: shade of the canopy, halved at CANOPY_M from the centre line."""
+"""Shade of the canopy in the light "heavy-shadow" (0 to 1), and a distance from the centre line.
+The shade is full up to half this distance, halved at this distance, and 0 from 1.5 times this
+distance on."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ class Span:
 
 
 def surface(land: TreeShade, hidden: NDArray[np.bool_], span: Span) -> Surface:
-    """Build the mesh of the terrain at the level of detail `span`. This mesh is nowhere higher than
-    the mesh of the finest level.
+    """Build the mesh of the terrain of `land` at the level of detail `span`. This mesh is nowhere
+    higher than the mesh of the finest level.
 
     `hidden` (rows, columns) marks the points of the finest grid that the road mesh covers.
     """
@@ -109,7 +111,8 @@ def lowered(z: FloatArray, step: int) -> FloatArray:
 
 
 def _in_chunks(vertices: NDArray[np.float32], shown: NDArray[np.bool_], span: Span) -> Surface:
-    """Build two triangles for each cell that is `shown`, in chunks of BLOCK x BLOCK cells."""
+    """Build two triangles for each cell of the grid of `vertices` that is `shown`, in chunks of
+    BLOCK x BLOCK cells. `span` is the level of detail."""
     columns = vertices.shape[1]
     j, i = np.nonzero(shown)
     block = (j // BLOCK) * (columns // BLOCK + 1) + i // BLOCK

@@ -92,7 +92,9 @@ def _tables() -> Tables:
 
 
 def _tinted_sun(kind: str, colour: list[float], strength: float, elevation: float) -> Colour:
-    """Return the sun's colour in clear air, redder at low elevation; at dusk blue is unscaled."""
+    """Return the sun's colour in clear air: `colour`, linear RGB, times `strength`, and redder at a
+    low `elevation` (rad). At dusk, red and green are multiplied by `strength` and blue is not
+    changed."""
     red, green, blue = colour
     if kind == "dusk":
         return red * strength, green * strength, blue

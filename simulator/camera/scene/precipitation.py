@@ -58,7 +58,8 @@ class Precipitation:
         }
 
     def draw(self, eye: Eye, focal_px: float) -> None:
-        """Draw the drops in front of `eye`; blending must be enabled."""
+        """Draw the drops in front of `eye`; `focal_px` (px) is the focal length. Blending must be
+        enabled."""
         drops = self._drops
         shift = np.append(-eye.place, 0.0) / drops.box_m
         shift[2] += _fall_phase(eye.place)
@@ -71,7 +72,8 @@ class Precipitation:
 
 
 def _fall_phase(place: NDArray[np.float64]) -> float:
-    """Return the fallen distance as a share of the box: a hash of the camera position in mm."""
+    """Return the fallen distance as a share of the box. It is a hash of `place`, the camera
+    position, in mm."""
     x, y, z = (round(float(v) * 1000.0) for v in place)
     mixed = (x * 73_856_093) ^ (y * 19_349_663) ^ (z * 83_492_791)
     return math.fmod((mixed % 1_000_003) * 0.6180339887498949, 1.0)

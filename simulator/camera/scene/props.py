@@ -38,9 +38,9 @@ SMALL_M2, SMALL_REACH_M = 14.0, 130.0
 """Props with a smaller area than SMALL_M2 (posts, lamps, signs) are drawn only up to SMALL_REACH_M,
 because they would flicker farther away."""
 BUILDING_M = 3.9
-"""A prop that extends farther than this from its origin counts as a building."""
+"""A prop that extends farther than this (m) from its origin counts as a building."""
 BUILDING_CLEAR_M = 1.0
-"""Least distance between a building and the wall line."""
+"""Least distance (m) between a building and the wall line."""
 OUTLINE_STEP_M = 2.0
 POST_STEP_M, LAMP_STEP_M, POLE_STEP_M = 50.0, 42.0, 40.0
 _WALLS: tuple[Point, ...] = (
@@ -157,7 +157,8 @@ class _Placer:
         self.parts: list[FloatArray] = []
 
     def add(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Add `template` (n, 12) at (`s`, `offset`) m to the candidates of `place`."""
+        """Add `template` (n, 12) at (`s`, `offset`) m to the candidates of `place`. `clear_m` (m)
+        is its least distance from the wall lines."""
         self.candidates.append((template, s, offset, clear_m))
 
     def place(self) -> None:
@@ -273,8 +274,9 @@ def _gathered(placer: _Placer) -> dict[str, Surface]:
 
 
 def _surface(parts: list[FloatArray], s: FloatArray, small: NDArray[np.bool_]) -> Surface:
-    """Build the surface of one material, in order of s, with a chunk every CHUNK_M. In each chunk
-    the triangles of small props come last, because the second level of detail leaves them out."""
+    """Build the surface of one material from the triangles `parts` of its props, in order of their
+    positions `s` (m), with a chunk every CHUNK_M. In each chunk the triangles of the props marked
+    in `small` come last, because the second level of detail leaves them out."""
     cell = (s / CHUNK_M).astype(np.int64)
     order = np.lexsort((s, small, cell))
     sizes = np.array([len(part) for part in parts])[order]

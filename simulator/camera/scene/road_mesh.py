@@ -34,8 +34,8 @@ _FAR = ((0, 2), (2, 3), (4, 5), (5, 7))
 VERGE = (Level(30.0, 0.04, 12.0), Level(90.0, 0.1, 24.0), Level(300.0, 0.3, 48.0))
 """Levels of detail of the verge, coarser than the levels of the asphalt."""
 LAP_M, LAP_DOWN_M, RISE_WEIGHT = 0.3, 0.06, 4.0
-"""Overlap of the verge below the asphalt (m), its depth there (m), and the weight of its height
-error. The weight keeps the verge below the asphalt at every level of detail."""
+"""Overlap of the verge below the asphalt (m), the verge's depth there (m), and the weight of errors
+of the verge's height. The weight keeps the verge below the asphalt at every level of detail."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,8 @@ def rows_of(road: Road) -> FloatArray:
 
 
 def build(road: Road, line: CentreLineSamples, terrain: Terrain) -> RoadMesh:
-    """Build the mesh of `road`, with skirts that end below the terrain."""
+    """Build the mesh of `road`, with skirts that end below `terrain`. `line` are the samples of the
+    road's centre line."""
     s = rows_of(road)
     pose = road.track.at(s)
     wall = road.wall_offset
@@ -105,8 +106,9 @@ def build(road: Road, line: CentreLineSamples, terrain: Terrain) -> RoadMesh:
 def _skirt(
     road: Road, line: CentreLineSamples, s: FloatArray, curvature: FloatArray, side: float
 ) -> FloatArray:
-    """Return the width (R,) m of the skirt on one side (1 left, -1 right), limited so that it
-    overlaps no part of the road."""
+    """Return the width (R,) m of the skirt on one side (1 left, -1 right) at the rows `s` (R,) m.
+    It is limited so that the skirt overlaps no part of the road. `line` are the samples of the
+    centre line, `curvature` (R,) is its curvature (1/m) at the rows."""
     width = np.full(len(s), 0.4)
     for share in (0.25, 0.5, 0.75, 1.0):
         offset = road.wall_offset + SKIRT_M * share

@@ -11,9 +11,10 @@ from simulator.track.road import Road
 from simulator.varied.look import RoadLook
 
 DRIVEN_M = 1.35
-"""Largest distance of a car's centre beyond the outermost marking on datagen's trajectories."""
+"""Largest distance (m) beyond the outermost marking of the centre of a car on datagen's
+trajectories."""
 PARKED_M = 2.1
-"""Width of the strip that a parked car needs."""
+"""Width (m) of the strip that a parked car needs."""
 BRIDGES = ("overpass", "footbridge", "gantry", "railway")
 """Styles of bridges that are used if a scenery theme has no bridges of its own."""
 

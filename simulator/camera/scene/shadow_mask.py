@@ -24,7 +24,8 @@ from simulator.camera.vegetation.scenery import Trees
 from simulator.track.road import Road
 
 Strip = NDArray[np.uint8]
-"""An unfolded mask (rows, columns): rows from right to left, columns once round the track."""
+"""A mask that is not cut into bands (rows, columns): rows from right to left across the road,
+columns once round the track."""
 
 TEXEL_M = 0.25
 GUARD, BAND_TEXELS = 8, 4080
@@ -41,7 +42,7 @@ SHARE = (0.40, 0.64)
 FINE = 2
 """Rays per texel in each direction; their mean smooths the shadow's edge over a texel."""
 ROAD_Z_M = 2.5
-"""Largest height of a bridge's origin above the road on which its shadow falls."""
+"""Largest height (m) of a bridge's origin above a part of the road on which its shadow can fall."""
 FARTHEST_M = 70.0
 SKY_BLUR_M = 3.0
 """Distance beyond a bridge's edges within which the bridge hides a part of the sky."""
@@ -69,7 +70,8 @@ class ShadowMask:
 
 @compiled
 def _dark_share(rows: Strip, first: int, count: int) -> float:
-    """Return the share of dark texels in `count` columns from `first`, wrapping round the track."""
+    """Return the share of dark texels in `count` columns of `rows` from the column `first` on. The
+    columns wrap round the track."""
     dark, columns = 0, rows.shape[1]
     for row in rows:
         for k in range(first, first + count):
@@ -116,7 +118,8 @@ def _hidden_sky(
     shape: tuple[int, ...], road: Road, along_m: float, bridges: Sequence[Bridge], light: Light
 ) -> Strip:
     """Return the share (rows, columns) of the sky that bridges hide, 0 to 255: the footprints of
-    the bridges, blurred over SKY_BLUR_M."""
+    the bridges, blurred over SKY_BLUR_M. `shape` is (rows, columns); `along_m` is the length (m) of
+    a texel along the road."""
     below: Strip = np.zeros(shape, dtype=np.uint8)
     cast_bridges(below, road, along_m, bridges, replace(light, sun_elevation=math.pi / 2))
     size = (2 * round(SKY_BLUR_M / along_m) + 1, 2 * round(SKY_BLUR_M / TEXEL_M) + 1)
@@ -124,7 +127,8 @@ def _hidden_sky(
 
 
 def _run_out(strip: Strip, road: Road, along_m: float, land: TreeShade) -> None:
-    """Fade the mask, in place, into the smooth shade of the terrain beyond the wall lines."""
+    """Fade the mask `strip`, in place, into `land`, the smooth shade of the terrain, beyond the
+    wall lines. `along_m` is the length (m) of a texel along the road."""
     rows, columns = strip.shape
     begin, end = RUN_OUT_M
     y = (np.arange(rows) + 0.5 - rows / 2) * TEXEL_M
@@ -155,7 +159,9 @@ def _folded(strip: Strip) -> NDArray[np.uint8]:
 
 
 def _cast_trees(strip: Strip, road: Road, along_m: float, trees: Trees, light: Light) -> None:
-    """Project the silhouette of each tree whose shadow reaches the road onto the road plane."""
+    """Add to `strip`, in place, the shadow of each tree whose shadow reaches the road: its
+    silhouette, projected onto the road plane. `along_m` is the length (m) of a texel along the
+    road."""
     silhouettes = foliage.silhouettes()
     sx, sy, sz = light.sun_direction
     level = max(float(np.hypot(sx, sy)), 1e-6)
@@ -179,8 +185,9 @@ def _cast_trees(strip: Strip, road: Road, along_m: float, trees: Trees, light: L
 def _stamp(
     strip: Strip, shape: NDArray[np.uint8], foot: FloatArray, axis: FloatArray, across: FloatArray
 ) -> None:
-    """Draw `shape` (its foot in the middle of the last row) into the parallelogram given by `foot`,
-    `axis` and `across` (column, row); each texel keeps the darker value."""
+    """Draw `shape`, a silhouette with its foot in the middle of the last row, into a parallelogram
+    of `strip`, in place. Each texel keeps the darker value. `foot`, `axis` (from foot to tip) and
+    `across` (the whole width) are (column, row) in texels."""
     corners = np.stack([foot - across / 2, foot + across / 2])
     corners = np.concatenate([corners, corners + axis])
     low = np.floor(corners.min(axis=0)).astype(int)
@@ -199,11 +206,12 @@ def _stamp(
 
 
 def _with_canopy(bridged: Strip, road: Road, along_m: float, rng: np.random.Generator) -> Strip:
-    """Return the mask `bridged` (rows, columns) of bridge shadows with a canopy added.
+    """Return the mask `bridged` (rows, columns) of bridge shadows with a canopy added. `along_m` is
+    the length (m) of a texel along the road.
 
-    The canopy is a thresholded noise field. The threshold of each WINDOW_M is chosen so that the
-    covered share of the asphalt equals a random share. If a bridge covers more, no canopy is added.
-    Over any 30 m the share lies between 0.3 and 0.8.
+    The canopy is a thresholded noise field. The threshold of each window of WINDOW_M is chosen so
+    that the covered share of the asphalt equals a random share. If a bridge covers more than this
+    share, no canopy is added. Over any 30 m the covered share lies between 0.3 and 0.8.
     """
     rows, columns = bridged.shape
     field = _blobs(rows, columns, along_m, rng)
@@ -232,7 +240,8 @@ def _with_canopy(bridged: Strip, road: Road, along_m: float, rng: np.random.Gene
 def _blobs(
     rows: int, columns: int, along_m: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Return a noise field (rows, columns) of leaf clumps and boughs with standard deviation 1."""
+    """Return a noise field (rows, columns) of leaf clumps and boughs with standard deviation 1.
+    `along_m` is the length (m) of a texel along the road."""
     field = np.zeros((rows, columns), dtype=np.float32)
     # Large clumps need only coarse noise.
     for size_m, weight, coarse in ((3.2, 1.0, 4), (1.3, 0.55, 2), (0.55, 0.3, 1)):
@@ -268,7 +277,8 @@ def cast_bridges(
 
 
 def _reach(boxes: FloatArray, sun: FloatArray) -> tuple[float, float]:
-    """Return the begin and end along the road (m from the bridge) of the shadows of `boxes`."""
+    """Return where the shadows of `boxes` begin and end along the road, in m from the bridge. `sun`
+    (3,) is the direction to the sun in the bridge's frame."""
     drop = boxes[:, 1, 2] + ROAD_Z_M
     shift = -sun[0] / max(sun[2], 1e-3) * drop
     low = np.minimum(boxes[:, 0, 0], boxes[:, 0, 0] + shift)
@@ -284,8 +294,10 @@ def _darkened(
     rows: int,
     sun: FloatArray,
 ) -> Strip:
-    """Return the shadow (rows, columns) of one bridge on `columns` (first, last) of the unfolded
-    mask, which may exceed its ends. `sun` (3,): direction to the sun in the bridge's frame."""
+    """Return the shadow (rows, columns) of one bridge, 0 to 255, on the columns `columns` (first,
+    last) of the unfolded mask. The columns may lie beyond the ends of the mask. `along_m` is the
+    length (m) of a texel along the road, `sun` (3,) the direction to the sun in the bridge's
+    frame."""
     first, last = columns
     s = (first + (np.arange((last - first) * FINE) + 0.5) / FINE) * along_m
     y = ((np.arange(rows * FINE) + 0.5) / FINE - rows / 2) * TEXEL_M
@@ -301,10 +313,11 @@ def _darkened(
 
 
 def _hit(reached: list[NDArray[np.float32]], box: FloatArray) -> NDArray[np.bool_]:
-    """Return a mask of the points from which a ray towards the sun meets a box (slab method).
+    """Return a mask of the points `reached` from which a ray towards the sun meets a `box` (slab
+    method).
 
-    Points and box (2, 3) are given in units of the ray: each coordinate is divided by the ray's
-    component along that axis.
+    The coordinates of the points (three arrays x, y, z) and of the box (2, 3) are each divided by
+    the component of the ray's direction along the same axis.
     """
     enter = np.zeros_like(reached[0])
     leave = np.full_like(reached[0], np.inf)

@@ -44,7 +44,8 @@ class Sky:
 
 
 def _panorama_size(focal_px: float) -> tuple[int, int]:
-    """Return width and height of the panorama in texels."""
+    """Return width and height of the panorama in texels, for pictures with the focal length
+    `focal_px`."""
     wanted = 2.0 * math.pi * focal_px * _SHARPNESS
     width = int(np.clip(2 ** math.ceil(math.log2(wanted)), *_WIDTHS))
     return width, width // 4

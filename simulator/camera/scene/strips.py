@@ -83,7 +83,9 @@ def _steps(
     ends: NDArray[np.intp],
     levels: Sequence[Level],
 ) -> NDArray[np.intp]:
-    """Return the spacing of the kept rows, in rows, for each level and chunk (levels, chunks)."""
+    """Return the spacing of the kept rows, in rows, for each level and chunk (levels, chunks). `s`
+    and `profile` are explained in `strip`; `starts` and `ends` (chunks,) are the first and the last
+    row of each chunk."""
     steps = np.ones((len(levels), len(starts)), dtype=np.intp)
     row = np.arange(len(s) - 1)
     chunk = row // CHUNK_ROWS
@@ -101,8 +103,9 @@ def _steps(
 
 
 def _between(rows: NDArray[np.intp], columns: int, sides: NDArray[np.intp]) -> NDArray[np.uint32]:
-    """Return indices of two triangles for each pair of columns (n, 2) between consecutive `rows`. A
-    triangle's last (provoking) vertex sets its flat attributes; it lies in the earlier row."""
+    """Return the indices of two triangles for each pair of columns in `sides` (n, 2) between
+    consecutive `rows` of a grid with `columns` columns. The last (provoking) vertex of a triangle
+    determines the triangle's flat attributes; it lies in the earlier row."""
     near, far = columns * rows[:-1, None, None] + sides, columns * rows[1:, None, None] + sides
     corners = [near[..., 0], far[..., 0], near[..., 1], far[..., 0], far[..., 1], near[..., 1]]
     return np.stack(corners, axis=-1).reshape(-1).astype(np.uint32)

@@ -158,7 +158,7 @@ def between(z: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) -> Terrain:
-    """Build the terrain round `road` in the style of `theme`."""
+    """Build the terrain round `road` in the style of `theme`, from the road's `survey`."""
     line, grid, near, base = survey.line, survey.grid, survey.near, survey.base
     rolling = _rolling(grid, rng) * theme.hills_m
     away = np.clip((near - road.wall_offset - 5.0) / 110.0, 0.0, 1.0)
@@ -173,7 +173,8 @@ def build(road: Road, survey: Survey, theme: Theme, rng: np.random.Generator) ->
 
 
 def _road_cap(road: Road, line: CentreLineSamples, grid: Grid) -> FloatArray:
-    """Return the greatest height (m) of each grid point at which it covers no part of the road."""
+    """Return for each point of `grid` the greatest height (m) at which the terrain covers no part
+    of the road. `line` are the samples of the centre line."""
     reach = road.wall_offset + 5.0 + 50.0
     offsets = np.arange(-reach, reach + 0.5 * grid.cell, 0.6 * grid.cell)
     s = line.s[:: max(1, round(0.6 * grid.cell / SAMPLE_M))]
@@ -208,7 +209,8 @@ def _spread(
 
 
 def _outside(line: CentreLineSamples, grid: Grid) -> FloatArray:
-    """Return 1 outside the loop of the road and 0 inside, on the grid, with a smooth transition."""
+    """Return 1 outside the loop of the centre line `line` and 0 inside, at the points of `grid`,
+    with a smooth transition."""
     loop = np.stack([(line.x - grid.x0) / grid.cell, (line.y - grid.y0) / grid.cell], axis=1)
     inside = np.zeros(grid.shape, dtype=np.float32)
     cv2.fillPoly(inside, [np.rint(loop).astype(np.int32)], 1.0)

@@ -30,7 +30,7 @@ class Theme:
     tree_density: float
     tree_reach_m: float = 45.0
     clearings: float = 0.3
-    """Amount by which the trees thin out in places, 0 to 0.35."""
+    """Amount, 0 to 0.35, by which the density of trees decreases in places."""
     hills_m: float = 8.0
     houses: float = 0.0
     stands: float = 0.0

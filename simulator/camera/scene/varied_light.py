@@ -11,7 +11,7 @@ SUNNY = ("clear", "dusk", "heavy-shadow")
 USUAL_ALBEDO, COMPENSATED = 0.13, 0.45
 """Albedo of the road for which the lights are exposed; exponent of the automatic exposure."""
 DARKEST_NIGHT_STOPS = -0.5
-"""Least exposure of a night picture in stops; with less the picture would be black."""
+"""Least exposure of a night picture in stops. Darker pictures would be black."""
 HEADLIGHT: Colour = (3.4, 3.2, 2.75)
 _NIGHT_SKY: Colour = (0.006, 0.007, 0.010)
 _GLOW: Colour = (0.010, 0.009, 0.010)
@@ -72,7 +72,7 @@ def _by_night(light: Light, look: Lighting) -> Light:
 
 
 def _with_low_sun(light: Light, elevation_deg: float) -> Light:
-    """Return `light` with a lower sun, which is also redder and dimmer."""
+    """Return `light` with the sun at `elevation_deg` (deg), where it is also redder and dimmer."""
     elevation = min(math.radians(elevation_deg), light.sun_elevation)
     clear = math.sin(elevation) / math.sin(max(light.sun_elevation, elevation))
     red, green, blue = light.sun

@@ -27,7 +27,8 @@ _FINE = 2
 _BARK = np.array([70.0, 55.0, 42.0])
 CORNERS = 6
 _BLEED = 4
-"""Number of texels by which mipmaps spread the alpha; the outline keeps this margin."""
+"""Number of texels by which mipmaps spread the alpha. The outline keeps this distance from the
+visible part of a tree."""
 Canvas = NDArray[np.float32]
 
 
@@ -88,14 +89,16 @@ def _finished(canvas: Canvas) -> NDArray[np.uint8]:
 
 
 def _disc(canvas: Canvas, x: float, y: float, radius: float, colour: FloatArray) -> None:
-    """Draw an opaque disc; x, y, radius are shares of the cell, from its lower left corner."""
+    """Draw an opaque disc on `canvas`. `x`, `y` and `radius` are shares of the cell's side; the
+    origin is the cell's lower left corner."""
     size = canvas.shape[0]
     centre = (round(x * size), round((1.0 - y) * size))
     cv2.circle(canvas, centre, max(1, round(radius * size)), (*colour.tolist(), 1.0), -1)
 
 
 def _trunk(canvas: Canvas, top: float, width: float, bark: FloatArray = _BARK) -> None:
-    """Draw a trunk up to the height `top`; `width` is half its width at the foot (cell shares)."""
+    """Draw a trunk of the colour `bark` on `canvas` up to the height `top`. `width` is half its
+    width at the foot. Both lengths are shares of the cell's side."""
     size = canvas.shape[0]
     for k in range(24):
         share = k / 23

@@ -14,9 +14,9 @@ from simulator.camera.vegetation import foliage
 from simulator.track.road import Road
 
 CLEAR_M = 1.6
-"""Least distance of a trunk from a wall line."""
+"""Least distance (m) of a trunk from a wall line."""
 DRY_M = 1.5
-"""Least height of trees and props above the sea level."""
+"""Least height (m) of trees and props above the sea level."""
 HEIGHT_M = {
     "oak": (6.0, 12.0), "poplar": (9.0, 17.0), "pine": (8.0, 16.0), "fir": (7.0, 18.0),
     "palm": (6.0, 10.0), "bush": (1.2, 3.0), "birch": (7.0, 13.0),
@@ -110,7 +110,8 @@ def _groves(road: Road, theme: Theme, rng: np.random.Generator) -> Sites:
 
 
 def _avenue(road: Road, theme: Theme, rng: np.random.Generator, *, tunnel: bool) -> Sites:
-    """Return tall trees along both wall lines: the theme's kinds that give shade, or pines."""
+    """Return tall trees along both wall lines: the theme's kinds that give shade, or pines if it
+    has none. With `tunnel` the rows are denser, and the crowns close over the road."""
     shady = [kind for kind in theme.trees if kind in SHADY] or ["pine"]
     step_m, overhang = (TUNNEL_STEP_M, TUNNEL_OVERHANG_M) if tunnel else (AVENUE_STEP_M, OVERHANG_M)
     step = road.track.length_m / max(1, round(road.track.length_m / step_m))
@@ -123,8 +124,8 @@ def _avenue(road: Road, theme: Theme, rng: np.random.Generator, *, tunnel: bool)
 
 
 def _tints(rng: np.random.Generator, sheds: NDArray[np.bool_], autumn: float) -> FloatArray:
-    """Return random colour factors (N, 3). `autumn` (0 to 1): share of the leaf-shedding trees
-    (`sheds`) that turn yellow or red, times 0.6."""
+    """Return random colour factors (N, 3). Of the trees marked in `sheds` (N,), the share 0.6 *
+    `autumn` turns yellow or red; `autumn` is from 0 to 1."""
     count = len(sheds)
     tone = rng.uniform(0.7, 1.25, (count, 1))
     tint = tone * (1.0 + rng.uniform(-0.12, 0.12, (count, 3)))

@@ -23,8 +23,8 @@ REACH_M = 420.0
 MOST = 160
 """Largest number of trees drawn at once; trees farther away are left out."""
 NEAR_M = 80.0
-"""Nearer trees are drawn in two passes and within their outline. For farther trees the additional
-vertices would cost more time than they save."""
+"""Distance (m) up to which trees are drawn in two passes and within their outline. For farther
+trees the additional vertices would cost more time than they save."""
 _SQUARE = ((-0.5, 0.0), (0.5, 0.0), (0.5, 1.0), (-0.5, 1.0))
 _SQUARE_FAN = np.array([[0, 1, 2], [0, 2, 3]])
 _OUTLINE_FAN = 4 + np.array([[0, k, k + 1] for k in range(1, CORNERS - 1)])

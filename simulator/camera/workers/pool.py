@@ -49,7 +49,7 @@ class _Worker:
     sceneries: set[int] = field(default_factory=set)
     due: set[int] = field(default_factory=set)
     heard: float = 0.0
-    """Time (`monotonic`, s) of its last answer or task."""
+    """Time (`monotonic`, s) of the worker's last answer, or of the last task sent to it."""
 
 
 class PicturePool:
@@ -90,7 +90,7 @@ class PicturePool:
     def number_of(self, scenery: Scenery) -> int:
         """Return the number by which a `Shot` refers to `scenery`. A scenery is sent to a worker
         only once."""
-        key = (id(scenery.road), scenery.light, scenery.light_seed)  # _sceneries keeps the id valid
+        key = (id(scenery.road), scenery.light, scenery.light_seed)  # _sceneries keeps the road
         if key not in self._numbers:
             self._numbers[key] = len(self._sceneries)
             self._sceneries.append(scenery)
@@ -103,8 +103,9 @@ class PicturePool:
         return self._pictures[view]
 
     def draw(self, shots: Sequence[Shot], views: tuple[str, ...]) -> None:
-        """Draw `views` of each shot's car. Raises PictureWorkerError, which names the worker, if a
-        worker dies or does not answer, and the UserError of a worker that cannot draw."""
+        """Draw `views` of the car of each of `shots`. Raises PictureWorkerError, which names the
+        worker, if a worker dies or does not answer, and the UserError of a worker that cannot
+        draw."""
         try:
             self._start()
             for worker in self._workers:
@@ -139,7 +140,8 @@ class PicturePool:
             os.close(descriptor)
 
     def _start_worker(self, number: int, cars: range, descriptor: int) -> _Worker:
-        """Start one worker, which inherits the shared memory, and send it its setup."""
+        """Start worker `number`, which draws the cars `cars`, and send it its setup. It inherits
+        the shared memory with the file `descriptor`."""
         mine, theirs = socket.socketpair()
         # A stopped worker reads nothing, so sending must have a time limit.
         mine.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", SILENCE_S, 0))
@@ -181,7 +183,8 @@ class PicturePool:
             raise self._death(worker) from None
 
     def _receive(self, waiting: list[_Worker]) -> None:
-        """Wait for an answer, and process all answers that have arrived."""
+        """Wait for an answer of one of the workers `waiting`, and process all answers that have
+        arrived."""
         due = min(worker.heard for worker in waiting) + SILENCE_S
         ready = set(wait([worker.connection for worker in waiting], max(due - monotonic(), 0.0)))
         for worker in waiting:
@@ -221,7 +224,8 @@ NEXT = "all picture workers have been ended, and reset() starts new ones"
 
 
 def _how(process: "subprocess.Popen[bytes]") -> str:
-    """Describe how a process that closed its connection ended, as in "ended with exit code 1"."""
+    """Describe how a process that closed its connection ended, for example "ended with exit code
+    1"."""
     try:
         code = process.wait(END_S)
     except subprocess.TimeoutExpired:
@@ -233,7 +237,8 @@ def _how(process: "subprocess.Popen[bytes]") -> str:
 
 
 def _end(workers: list[_Worker], owner: int) -> None:
-    """Kill and reap the workers. In a forked child, only close its copies of the connections."""
+    """Kill and reap the workers. `owner` is the id of the process that started them; in a process
+    forked from it, only close the forked process's copies of the connections."""
     for worker in workers:
         worker.connection.close()
         if owner == os.getpid():

@@ -120,7 +120,8 @@ def main(connection: Connection, descriptor: int, parent: int) -> None:
 def draw(
     shot: Shot, views: tuple[str, ...], cameras: Cameras, pictures: dict[str, NDArray[Any]]
 ) -> None:
-    """Draw `views` of the shot's car into that car's rows of `pictures` (cars, *shape)."""
+    """Draw `views` of the car of `shot` into that car's rows of `pictures` (cars, *shape). The
+    camera of the car's scenery is taken from `cameras`."""
     camera = cameras.of(shot.scenery)
     drawn = camera.render_views(shot.pose, shot.others, views, near_s=shot.s)
     for view, picture in drawn.items():

@@ -2,14 +2,15 @@
 
 The sequence number is odd during a write, and even afterwards; each write increases it by two. A
 reader copies the message between two reads of the sequence, and discards the copy unless both reads
-gave the same even number. Memory orderings after Boehm, "Can seqlocks get along with programming
-language memory models?" (MSPC 2012): relaxed atomic words, a release fence after the odd store and
-an acquire fence before the second read. They are correct on all architectures. `c/protocol.h` does
-the same in C11.
+gave the same even number. The memory orderings are taken from Boehm, "Can seqlocks get along with
+programming language memory models?" (MSPC 2012): relaxed atomic words, a release fence after the
+odd store and an acquire fence before the second read. These orderings are correct on all
+architectures. `c/protocol.h` does the same in C11.
 
 Arrays: `sequence` (1,) uint32 and `shared` (n,) uint64 are views of the same shared memory. `local`
 (n,) uint64 is a local copy of the message; word 0 is the sequence, word n-1 the checksum.
-`shared_image` and `local_image` (k,) uint64 belong to the same message; k may be 0.
+`shared_image` and `local_image` (k,) uint64 are the message's image in the shared memory and its
+local copy; k may be 0.
 """
 
 from typing import Any

@@ -15,7 +15,8 @@ lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500
 BULGE_M: Final = 0.3
-"""Largest distance between a bend and the chord of a piece (5 m long, radius 12 m: 0.26 m)."""
+"""Largest distance (m) between a bend and the chord of a piece: 0.26 m for a piece of 5 m length
+and a radius of 12 m."""
 
 
 def keeps_clear(segments: list[Segment]) -> bool:

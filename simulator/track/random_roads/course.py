@@ -22,8 +22,9 @@ SHARP_DEG: Final = 35.0
 """Least turn of a corner that may consist of several arcs."""
 MIN_BANKED_SPIRAL_M: Final = 8.0
 RANK_NOISE: Final = 0.6
-"""Largest random change of the logarithm of the radius that fits a corner, before corners are
-sorted by it. Because of the sorting, small radii mostly are in corners with little room."""
+"""Largest random change of the logarithm of the radius that fits a corner. The corners are sorted
+by the changed radius, and small radii are assigned to the first corners. So small radii are mostly
+in corners with little room."""
 
 
 class DoesNotFit(Exception):
@@ -85,7 +86,9 @@ def draw_course(kind: Kind, unevenness: float, rng: np.random.Generator) -> Cour
 
 
 def _polygon(kind: Kind, unevenness: float, rng: np.random.Generator) -> FloatArray:
-    """Return random corners (n, 2) round a centre, at uneven angles and distances."""
+    """Return random corners (n, 2) in m round a centre, at uneven angles and distances. The
+    logarithm of the distances is random in [-unevenness, unevenness], before the corners are
+    scaled."""
     count = int(rng.integers(kind.corners[0], kind.corners[1], endpoint=True))
     gaps = rng.uniform(0.65, 1.35, count)
     around = np.cumsum(gaps) * (2.0 * math.pi / gaps.sum())
@@ -100,8 +103,8 @@ def _polygon(kind: Kind, unevenness: float, rng: np.random.Generator) -> FloatAr
 
 
 def _turns(edges: FloatArray) -> FloatArray:
-    """Return the turn (n,) at the start of each edge, deg with three decimals; their sum is
-    +-360."""
+    """Return the turn (n,) at the start of each of `edges` (n, 2), in degrees with three decimals.
+    The sum of the turns is 360 or -360."""
     before = np.roll(edges, 1, axis=0)
     cross = before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0]
     turns = np.degrees(np.arctan2(cross, (before * edges).sum(axis=1)))
@@ -113,8 +116,8 @@ def _turns(edges: FloatArray) -> FloatArray:
 def _corners(
     kind: Kind, turns: FloatArray, largest: FloatArray, rng: np.random.Generator
 ) -> tuple[Corner, ...]:
-    """Return a bend for each turn. The radii are log-uniform over all bends. Small radii are in
-    corners whose `largest` possible radius is small."""
+    """Return a bend for each of `turns` (n,), in degrees. The radii are log-uniform over all bends.
+    Small radii are in corners whose `largest` possible radius (n,), m, is small."""
     count = len(turns)
     low, high = np.log(kind.radius_m)
     radii = np.exp(low + (high - low) * (np.arange(count) + rng.uniform(size=count)) / count)
@@ -146,7 +149,8 @@ def _corner(kind: Kind, turn: float, radius: float, rng: np.random.Generator) ->
 
 
 def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) -> Corner:
-    """Return two or three arcs that join without spirals; the smallest radius is `radius`."""
+    """Return a corner of `turn` degrees that consists of two or three arcs without spirals. Its
+    smallest radius is `radius` (m)."""
     count = int(rng.integers(2, 4))
     shares = rng.uniform(0.6, 1.4, count)
     angles = [round(float(a), 3) for a in turn * shares / shares.sum()]
@@ -160,7 +164,8 @@ def _compound(kind: Kind, turn: float, radius: float, rng: np.random.Generator) 
 
 
 def _fitted(kind: Kind, corners: tuple[Corner, ...], room: FloatArray) -> tuple[Corner, ...]:
-    """Shrink the corners that need more than `room` (n,) of an edge. Raises DoesNotFit."""
+    """Shrink each corner that needs more of an edge than its `room` (n,), m. Raises DoesNotFit if a
+    corner then has too small a radius or is too short."""
     need = np.maximum(*_tangents(corners))
     factors = np.minimum(1.0, 0.995 * room / need).tolist()
     fitted = []
@@ -196,7 +201,9 @@ def _tangents(corners: tuple[Corner, ...]) -> tuple[FloatArray, FloatArray]:
 
 
 def _closed(before: FloatArray, corners: tuple[Corner, ...]) -> Course:
-    """Return the course with straights that close the loop; it starts with the longest straight."""
+    """Return the course with straights that close the loop; it starts with the longest straight.
+    `before` (n,) is the length (m) of the straight before each corner. Raises DoesNotFit if a
+    straight is too short."""
     first = int(np.argmax(before))
     order = [*range(first, len(corners)), *range(first)]
     segments: list[Segment] = []

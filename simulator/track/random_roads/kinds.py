@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 BLOCK: Final = 20
-"""Sum of the shares: each run of `BLOCK` seeds from a multiple of it has the kinds by share."""
+"""Number of consecutive seeds that form a block; a block starts at a multiple of this number. The
+shares of all kinds add up to it. In each block every kind occurs as often as its `share` states."""
 
 Range = tuple[float, float]
 
@@ -23,16 +24,16 @@ class Kind:
 
     name: str
     share: int
-    """Number of roads of this kind among `BLOCK` consecutive seeds."""
+    """Number of roads of this kind in each block of `BLOCK` seeds."""
     corners: tuple[int, int]
     """Least and greatest number of corners of a lap."""
     edge_m: Range
-    """Mean distance from corner to corner."""
+    """Mean distance from one corner to the next corner."""
     unevenness: float
     """Amount by which the distance of the corners from the centre varies; 0: a round course."""
     radius_m: Range
     """Radius of the bends, log-uniform. A bend that does not fit between its neighbours gets a
-    smaller radius, down to the least one."""
+    smaller radius, but not a radius below the range."""
     abrupt: float
     """Share of the bends that begin and end without a spiral."""
     compound: float

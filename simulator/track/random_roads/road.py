@@ -33,7 +33,8 @@ from simulator.track.toml_track import Table, build_track, read_segments
 RANDOM: Final = "random"
 MAX_SEED: Final = 2**63 - 1
 CALMER: Final = 0.98
-"""Factor on the unevenness after each course that does not fit, so that finally a course fits."""
+"""Factor by which the unevenness of the course is reduced after each random course that does not
+fit, so that finally a course fits."""
 DASHES: Final = ((3.0, 6.0), (4.0, 8.0), (6.0, 12.0), (3.0, 9.0))
 Row = dict[str, Any]
 _SEED: Final = re.compile(r"[0-9]{1,19}")
@@ -120,7 +121,8 @@ def _course_rows(kind: Kind, rng: np.random.Generator) -> list[Row]:
 
 
 def _rows(course: Course) -> list[Row]:
-    """Return the rows of a lap that starts and ends in the middle of the first straight."""
+    """Return the TOML rows of a lap of `course` that starts and ends in the middle of the first
+    straight."""
     half = round(course.straights[0] / 2.0, 3)
     rows: list[Row] = []
     for length, corner in zip((half, *course.straights[1:]), course.corners, strict=True):

@@ -50,7 +50,9 @@ def read_pieces(segments: Section, main: Section, width: float) -> Iterator[Piec
 def _segment_pieces(
     segment: Section, profile: Profile, width: float, global_step: float
 ) -> Iterator[Piece]:
-    """Yield the pieces of one segment, and store its end in `profile`."""
+    """Yield the pieces of one segment, and store the heights and slopes at its end in `profile`.
+    `width` (m) is the track's width, `global_step` (m) the track's default length of a profile
+    step."""
     sign, radius, radius_end, length = _plan(segment)
     start, end = _end_heights(segment, profile, width, length)
     spline = (segment.text("profil") or "spline") == "spline"
@@ -106,7 +108,9 @@ def _check_length(segment: Section, name: str, value: float) -> None:
 def _end_heights(
     segment: Section, profile: Profile, width: float, length: float
 ) -> tuple[Edges, Edges]:
-    """Return the heights (m) of both edges at the start and at the end of a segment."""
+    """Return the heights (m) of both edges at the start and at the end of a segment of `length` m.
+    `profile` contains the end of the previous segment; its grade is replaced if the segment sets
+    one."""
     start = _edges(segment.length, "z start", profile.end)
     end = _edges(segment.length, "z end", profile.end)
     grade = segment.number("grade")
@@ -122,7 +126,9 @@ def _end_heights(
 
 
 def _edges(read: Callable[[str], float | None], name: str, default: Edges) -> Edges:
-    """Return the attribute `name`, given for both edges or for each, else `default`."""
+    """Return the attribute `name` of both edges. It is set for both edges together, or separately
+    for the left and the right edge; an edge for which it is not set has the value of `default`.
+    `read` returns an attribute by its name, or None."""
     left, right = (read(f"{name} {side}") for side in ("left", "right"))
     both = read(name)
     if both is not None:
@@ -135,14 +141,17 @@ def _mean(edges: Edges) -> float:
 
 
 def _banked(middle: float, edges: Edges, banking: float | None, width: float) -> Edges:
-    """Return both edges' heights (m) from the middle's height and the banking (rad)."""
+    """Return both edges' heights (m) from the height `middle` (m) of the road's middle and the
+    `banking` (rad). If `banking` is None, the height difference of `edges` (m) is used. `width` (m)
+    is the track's width."""
     # Without a banking angle of its own, a segment keeps the height difference of its edges.
     half = (edges[0] - edges[1]) / 2.0 if banking is None else math.tan(banking) * width / 2.0
     return np.array([middle + half, middle - half])
 
 
 def _step_count(segment: Section, length: float, global_step: float) -> int:
-    """Return the number of profile steps. Raises TrackError if it is out of range."""
+    """Return the number of profile steps of a segment of `length` m. `global_step` (m) is the
+    track's default length of a step. Raises TrackError if the number is out of range."""
     steps = int(_or(segment.number("profil steps"), 1.0))
     if steps == 1:
         step_length = _or(segment.length("profil steps length"), global_step)
@@ -159,7 +168,10 @@ def _step_count(segment: Section, length: float, global_step: float) -> int:
 def _tangents(
     segment: Section, profile: Profile, start: Edges, end: Edges, length: float, spline: bool
 ) -> tuple[Edges, Edges]:
-    """Return the slopes of both edges at the start and at the end of the profile."""
+    """Return the slopes (dz/ds) of both edges at the start and at the end of a segment of `length`
+    m. `start` and `end` are the heights (m) of the edges; without `spline` the slopes are constant
+    between them. With `spline`, slopes that the segment does not set are the slopes at the end of
+    the previous segment, from `profile`."""
     if not spline:
         chord: Edges = (end - start) / length
         return chord, chord
@@ -173,7 +185,9 @@ def _tangents(
 def _steps(
     steps: int, length: float, radius: float, radius_end: float, arc: float
 ) -> tuple[list[float], list[float]]:
-    """Return length and radius of every step; a spiral's steps together turn by `arc` rad."""
+    """Return length and radius (m) of each of `steps` steps of a segment of `length` m, whose
+    radius changes from `radius` to `radius_end` (m). The steps of a spiral turn by `arc` rad in
+    total."""
     step = length / steps
     if radius == radius_end or steps == 1:
         # A single step has only the start radius, so its length follows from the arc.
@@ -188,7 +202,9 @@ def _steps(
 def _hermite(
     start: Edges, end: Edges, tangents: tuple[Edges, Edges], length: float, t: float
 ) -> Edges:
-    """Return the heights at the share `t` of the segment, by a cubic with these end slopes."""
+    """Return the heights (m) of both edges at the share `t` (0 to 1) of a segment of `length` m.
+    They follow a cubic with the heights `start` and `end` (m) and the slopes `tangents` at both
+    ends."""
     if t == 1.0:
         return end
     h_end = t * t * (3.0 - 2.0 * t)

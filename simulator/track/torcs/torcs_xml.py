@@ -61,7 +61,8 @@ class Section:
         return self._number(name, RATIO, "an angle, a ratio or a plain number")
 
     def _number(self, name: str, dimension: Dimension, expected: str) -> float | None:
-        """Return the numeric attribute `name` in SI units, None if absent. Raises TrackError."""
+        """Return the numeric attribute `name` in SI units, None if absent. Raises TrackError unless
+        its unit has the `dimension`; `expected` describes the dimension in the message."""
         attribute = self._attribute("attnum", name)
         if attribute is None:
             return None
