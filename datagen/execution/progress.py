@@ -23,8 +23,8 @@ from datagen.recorder.job import FramesDone, RoundDone
 
 
 class ProgressCallback(Protocol):
-    """Called with the numbers of frames and rounds recorded so far, including those of earlier
-    runs."""
+    """Called with the numbers of frames and rounds recorded so far, including the frames and rounds
+    of earlier runs."""
 
     def __call__(self, done_frames: int, done_rounds: int) -> None: ...
 

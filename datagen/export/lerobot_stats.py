@@ -58,8 +58,9 @@ class Histogram:
 
     @staticmethod
     def of(steps: Sequence[Step], camera: CameraParameters) -> "Histogram":
-        """Count the pixels in all frames of an episode, or in 100 frames (MOST_IMAGES) evenly
-        spread over a longer one. Raises ValueError for an image that cannot be decoded."""
+        """Count the pixels in all frames `steps` of an episode, or in 100 frames (MOST_IMAGES)
+        evenly spread over a longer episode. Raises ValueError for an image that cannot be
+        decoded."""
         found = Histogram()
         image = np.empty((camera.height, camera.width, 3), np.uint8)
         chosen = np.linspace(0, len(steps) - 1, min(len(steps), MOST_IMAGES)).astype(int)

@@ -68,7 +68,8 @@ def _add_sample(shard: tarfile.TarFile, info: RoundInfo, step: Step, codec: str)
 
 
 def sample(info: RoundInfo, step: Step) -> dict[str, Any]:
-    """Return the content of KEY.json for a frame; absent distances are None (null)."""
+    """Return the content of KEY.json for the frame `step` of the round `info`. Absent distances are
+    None (null)."""
     return {
         "round": info.id,
         "frame": step.number,

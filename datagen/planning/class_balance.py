@@ -44,8 +44,8 @@ class Forecast(Protocol):
     """Forecasts the classes of a round's frames for several possible starts of the round."""
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
-        """Return the shares (N, 3) of left, straight and right frames if the round starts at
-        `starts` (N,), which are shares of the lap's length."""
+        """Return the shares (N, 3) of left, straight and right frames for N possible starts of the
+        round `entry`. `starts` (N,) are positions on the lap, as shares of the lap's length."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class TrackForecast:
 
     @staticmethod
     def of(choices: tuple[TrackChoice, ...], tracks_dir: Path | None) -> "TrackForecast":
-        """Create the forecast for the chosen tracks, read from their files. A random road is
+        """Create the forecast for the tracks `choices`, read from their files. A random road is
         generated at the first forecast of a round on it."""
         named = (c.name for c in choices if c.name != RANDOM)
         return TrackForecast({name: find_track(name, tracks_dir) for name in named})

@@ -180,8 +180,9 @@ def _lights(config: CollectConfig, rng: np.random.Generator) -> list[tuple[str, 
 
 
 def _starts(tracks: Sequence[TrackChoice], rng: np.random.Generator) -> list[float]:
-    """Start of each round as a share of the lap, [0, 1). The starts of rounds on the same track
-    follow a golden-ratio sequence, which spreads them evenly."""
+    """Return the start of each round as a share of the lap, [0, 1). `tracks` has the track of each
+    round. The starts of rounds on the same track follow a golden-ratio sequence, which spreads them
+    evenly."""
     golden = 0.6180339887498949
     first = {choice.name: rng.uniform() for choice in dict.fromkeys(tracks)}
     rounds_on: dict[str, int] = {}

@@ -82,7 +82,7 @@ def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) ->
 
 def drive_frames(track: Track, laps: float, frequency_hz: int) -> int:
     """Return the number of frames in which the scripted driver drives `laps` laps from the start
-    line.
+    line, at `frequency_hz` frames per second.
 
     The drive is simulated without images. The speed profile alone would give up to 11 % fewer
     frames, because the driver brakes for limits 0.5 s ahead and accelerates after each bend.

@@ -158,7 +158,8 @@ def discard_partial(folder: Path, round_id: str) -> None:
 
 
 def discard_partials(folder: Path, round_ids: Iterable[str]) -> None:
-    """Remove the unfinished files of these rounds that a crash or an interruption has left."""
+    """Remove the unfinished files of the rounds with the ids `round_ids` that a crash or an
+    interruption has left."""
     for round_id in round_ids:
         discard_partial(folder, round_id)
     with suppress(OSError):  # the folder is missing, or other rounds are being written

@@ -43,7 +43,7 @@ class Labels:
 def read_labels(
     index: RoundIndex, round_number: int, frames: NDArray[np.int64] | None = None
 ) -> Labels:
-    """Read the labels of the frames `frames` (N,) of a round; None: of all frames.
+    """Read the labels of the frames `frames` (N,) of the opened round `index`; None: of all frames.
 
     `round_number` is the value of the column `round`. Raises DatasetError if an image has no label
     or state, or a label of `frames` is damaged.
@@ -88,8 +88,8 @@ def read_labels(
 
 
 def light_per_frame(index: RoundIndex) -> NDArray[np.str_]:
-    """Return the name of the light (N,) at each frame of a round. It is computed from the log
-    times, because frames of a recovered round can be missing."""
+    """Return the name of the light (N,) at each frame of the opened round `index`. It is computed
+    from the log times, because frames of a recovered round can be missing."""
     header = index.header
     frames = steps_at(index.messages[CAMERA].log_time, header.frequency_hz)
     stretch = header.stretch or int(frames.max(initial=0)) + 1

@@ -1,6 +1,7 @@
 """Recovers a damaged round file: writes its intact frames as a new round, marked as recovered.
 
-A frame is intact if all its messages are intact: image, label and all others of the same step.
+A frame is intact if all its messages are intact: the image, the label and all other messages of
+this frame.
 """
 
 import hashlib
@@ -108,7 +109,8 @@ def default_out(file: Path) -> Path:
 
 
 def find_intact_frames(data: bytes, frequency_hz: int) -> IntactFrames:
-    """Find all intact frames in the bytes of a round file, before and after the damage."""
+    """Find all intact frames in `data`, the bytes of a round file with `frequency_hz` frames per
+    second, before and after the damage."""
     steps: dict[int, Step] = defaultdict(dict)
     scene = None
     for chunk in find_chunks(data):

@@ -133,7 +133,7 @@ def _unexpected_files(folder: Path) -> Iterator[str]:
 
 def _duplicate_rounds(rounds: list[RoundIndex]) -> Iterator[str]:
     """Yield a problem for each file whose name is not the id of its round, and for each file with
-    the same images and labels as an earlier one."""
+    the same images and labels as a file before it."""
     contents: dict[str, str] = {}
     for index in rounds:
         name, header = index.path.name, index.header

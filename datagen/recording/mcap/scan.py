@@ -167,7 +167,8 @@ class _Scanner:
             self._found.problems.append(f"a message index at byte {start} does not match its chunk")
 
     def _end_chunk(self) -> None:
-        """Add a problem if a channel of the last chunk has no message index, but others have."""
+        """Add a problem if channels of the last chunk have no message index, although at least one
+        chunk read so far has message indexes."""
         chunks = self._found.chunks
         if self._entries and chunks and any(chunk.indexes for chunk in chunks):
             self._found.problems.append(f"no message index for channels {sorted(self._entries)}")

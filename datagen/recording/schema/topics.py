@@ -58,7 +58,8 @@ def log_time_ns(step: int, frequency_hz: int) -> int:
 
 
 def steps_at(log_times: NDArray[np.int64], frequency_hz: int) -> NDArray[np.int64]:
-    """Return the frame numbers (N,) of the log times `log_times` (N,) in ns."""
+    """Return the frame numbers (N,) of the log times `log_times` (N,) in ns of a round with
+    `frequency_hz` frames/s."""
     steps: NDArray[np.int64] = -(-(log_times - EPOCH_NS) * frequency_hz // NANOSECONDS)
     return steps
 
