@@ -12,9 +12,9 @@ float32 values at 1 is 1.2e-7."""
 
 
 def clip_rounding(value: float, low: float, high: float) -> float:
-    """Return `value`, or the bound if `value` exceeds it by at most 1e-6 (by 1e-6 of the bound, if
-    the bound is larger than 1). A value that exceeds a bound by more is returned unchanged, so that
-    the caller can refuse it."""
+    """Return `value`, or the bound (`low` or `high`) if `value` exceeds it by at most 1e-6 (by 1e-6
+    of the bound, if the bound is larger than 1). A value that exceeds a bound by more is returned
+    unchanged, so that the caller can refuse it."""
     bound = min(max(value, low), high)
     # The comparison is false for NaN, which is returned unchanged.
     return bound if abs(value - bound) <= ROUNDING * max(1.0, abs(bound)) else value

@@ -112,13 +112,14 @@ class Pedals:
         return self._car.gears[gear - 1] * self._car.final_drive
 
     def _engine_braking(self, speed: float, gear: int) -> float:
-        """Return the engine's braking torque at closed throttle, as a share of full-load torque."""
+        """Return the engine's braking torque at closed throttle, at `speed` (m/s) in `gear`, as a
+        share of the full-load torque."""
         car = self._car
         above = max(self._rpm(speed, gear) - car.idle_rpm, 0.0)
         return car.engine_braking * above / (car.top_rpm - car.idle_rpm)
 
     def _full_throttle_force(self, speed: float, gear: int) -> float:
-        """Return the driving force (N) at full throttle at `speed` (m/s)."""
+        """Return the driving force (N) at full throttle, at `speed` (m/s) in `gear`."""
         car = self._car
         rpm = max(self._rpm(speed, gear), car.idle_rpm)
         torque = float(np.interp(rpm, np.arange(len(car.torque)) * 1000.0, car.torque))

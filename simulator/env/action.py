@@ -35,8 +35,8 @@ def check_controls(controls: str) -> None:
 
 
 def action_space(controls: Controls) -> gym.spaces.Box:
-    """Return the action space, float32: shape (1,) for steering, or (4,) for steering, throttle,
-    brake and gear."""
+    """Return the action space, float32: shape (1,) for the controls "steer", or (4,) (steering,
+    throttle, brake, gear) for the controls "full"."""
     low, high = zip(*(LIMITS[name] for name in NAMES[controls]), strict=True)
     return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
@@ -64,10 +64,11 @@ def to_command(action: Any, controls: Controls) -> Command:
 
 
 def to_rows(actions: Any, controls: Controls, moving: NDArray[np.bool_]) -> FloatArray:
-    """Convert `actions` (N, 1) or (N, 4) to rows of steer, throttle, brake and gear (N, 4); the
-    gear is rounded. For (N, 1), throttle is 0.2, brake 0 and gear 1. Only the cars that are
-    `moving` (N,) are checked: values beyond their bounds by no more than float32 rounding are
-    clipped, values farther outside raise a UserError that names the car."""
+    """Convert `actions`, (N, 1) for the controls "steer" or (N, 4) for "full", to rows of steer,
+    throttle, brake and gear (N, 4); the gear is rounded. For (N, 1), throttle is 0.2, brake 0 and
+    gear 1. Only the cars that are `moving` (N,) are checked: values beyond their bounds by no more
+    than float32 rounding are clipped, values farther outside raise a UserError that names the
+    car."""
     names = NAMES[controls]
     values = _numbers("actions", actions)
     if values.shape != (len(moving), len(names)):

@@ -82,7 +82,7 @@ class Cars:
         return self.drives[number].world
 
     def beams_of(self, number: int) -> FloatArray | None:
-        """Return the range beams (19,) of a car in m; None if they are not computed."""
+        """Return the range beams (19,) of car `number` in m; None if they are not computed."""
         return self.beams[number] if self.beams.size else None
 
     def reset(self, number: int, rng: np.random.Generator, start: Mapping[str, Any]) -> int:

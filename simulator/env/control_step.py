@@ -76,8 +76,8 @@ def step_cars(
     begin: int, end: int, fleet: Arrays, steps: int, outputs: Outputs, rules: Rules
 ) -> None:
     """Advance the cars `begin` to `end` - 1 by one control step of `steps` physics steps, and fill
-    their outputs. A car that touches something stops before the end of the step, and its outputs
-    are not filled; `Cars.step` completes its control step."""
+    their `outputs` by the `rules` of the environment. A car that touches something stops before the
+    end of the step, and its outputs are not filled; `Cars.step` completes its control step."""
     work, lent, filled = make_work(), lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         if advance_car(number, lent, steps, lend_work(work)):
@@ -88,8 +88,8 @@ def step_cars(
 def observe_cars(
     begin: int, end: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool
 ) -> None:
-    """Fill the outputs of the cars `begin` to `end` - 1, after a step or, if `first`, at the start
-    of an episode."""
+    """Fill the `outputs` of the cars `begin` to `end` - 1 by the `rules` of the environment. This
+    is called after a step or, with `first` true, at the start of an episode."""
     lent, filled = lend(fleet), lend_outputs(outputs)
     for number in range(begin, end):
         observe_car(number, lent, filled, rules, first)
@@ -105,8 +105,8 @@ def lend_outputs(outputs: Outputs) -> Outputs:
 
 @compiled
 def observe_car(number: int, fleet: Arrays, outputs: Outputs, rules: Rules, first: bool) -> None:
-    """Fill the outputs of car `number`. `first` is True at the start of an episode, when reward,
-    score and ending are 0."""
+    """Fill the `outputs` of car `number` by the `rules` of the environment. `first` is True at the
+    start of an episode, when reward, score and ending are 0."""
     states, results, beams, noise = outputs
     ends, rewarded, weight, limit, angles = rules
     car, result = fleet[0][number], results[number]

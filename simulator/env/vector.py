@@ -214,7 +214,7 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         self._observer.restart(number, episode)
 
     def _observe(self, chosen: NDArray[np.bool_]) -> Any:
-        """Observe the `chosen` cars (N,) anew; returns the observations of all cars."""
+        """Observe the `chosen` cars (N,) again; returns the observations of all cars."""
         try:
             return self._observer.observe(chosen)
         except BaseException:  # the cars have moved, but nothing has been returned
@@ -301,8 +301,8 @@ def _of_each_car(listed: dict[str, list[Any]], count: int) -> list[dict[str, Any
 def _options_by_car(
     given: dict[str, Any], count: int
 ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-    """Split options into lists with a value for each of `count` cars, and values shared by all
-    cars."""
+    """Split the options `given` into lists with a value for each of `count` cars, and values that
+    all cars share."""
     listed, own = _lists({name: given[name] for name in PER_CAR if name in given}, count)
     shared = {name: value for name, value in given.items() if name not in PER_CAR} | own
     if isinstance(shared.get("start"), Mapping):

@@ -88,8 +88,8 @@ class VectorObserver:
         return pictures.copy() if self._copy else pictures
 
     def _read_sensors(self, numbers: Sequence[int]) -> dict[str, NDArray[Any]]:
-        """Read the sensors of the cars `numbers` anew; returns the readings (N, ...) of all cars by
-        sensor name."""
+        """Read the sensors of the cars `numbers` again; returns the readings (N, ...) of all cars
+        by sensor name."""
         if self._first.batched:
             return {
                 sensor.name: sensor.limit(self._cars.beams).astype(sensor.dtype)

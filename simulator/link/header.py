@@ -56,7 +56,8 @@ def _comment(field: Field) -> str:
 
 
 def _assertions(block: Block) -> str:
-    """Return static assertions that the compiler's offsets equal the offsets of the layout."""
+    """Return C code of static assertions that the compiler's offsets of the fields of `block` equal
+    the offsets of the layout."""
     struct = f"struct drvlink_{block.name}"
     lines = [
         f"DRVLINK_ASSERT(offsetof({struct}, {name}) == {offset});\n"

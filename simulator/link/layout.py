@@ -60,7 +60,8 @@ class Refusal(IntEnum):
 
 
 class Ended(IntEnum):
-    """Why the episode has ended (STATE.ended); names are those of `simulator.env.reward.Ending`."""
+    """Why the episode has ended (STATE.ended). The names are the names in
+    `simulator.env.reward.Ending`."""
 
     NOT = 0
     OFF_TRACK = 1

@@ -22,7 +22,8 @@ from simulator.track.pieces import Placed
 Source = Literal["own", "torcs", "csv"]
 Surface = Literal["asphalt", "gravel", "concrete"]
 _UNDECODABLE = re.compile(r"[\ud800-\udfff]")
-"""Surrogates to which Python decodes those bytes of a file name that are not UTF-8."""
+"""Surrogate characters. Python decodes each byte of a file name that is not UTF-8 to one of
+them."""
 
 
 def readable_name(name: str) -> str:

@@ -13,7 +13,7 @@ from simulator.arrays import FloatArray
 from simulator.track.errors import TrackError
 
 MAX_TURN: Final = math.pi / 2
-"""Largest turn of a piece, rad; up to it, the foot point on an arc is unique near the arc."""
+"""Largest turn (rad) of a piece. Up to this turn, points near an arc have one foot point on it."""
 MAX_GAP_M: Final = 0.28
 """Largest gap between the last piece and the first. Of the 38 tracks of TORCS 1.3.7 all but two
 close within 0.09 m; forza has a gap of 0.152 m, wheel-2 of 0.262 m. TORCS accepts both."""

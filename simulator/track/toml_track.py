@@ -7,7 +7,8 @@
                  spiral (m, each end), banking (deg, outer edge up)
     grade (%, uphill positive) of a segment holds until a later segment sets another one.
     hash         "segments": the track's hash is computed from the numbers in the file, which are
-                 the same on every machine; "geometry" (default): from the pieces computed from them
+                 the same on every machine; "geometry" (default): from the pieces computed from
+                 these numbers
 
 The bends must turn by +-360 degrees in total. Straights are adjusted by up to a metre so that the
 loop closes exactly. The mean grade is subtracted so that the heights close too.

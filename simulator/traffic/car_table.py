@@ -171,7 +171,8 @@ def decide_lane_change(
 ) -> None:
     """Start a lane change of car `i` into the best adjacent lane, if it is safe and the car gains
     at least 0.2 m/s2 more acceleration than 0.2 times the new follower's loss (MOBIL, Kesting
-    2007). `lane_y` (lanes,) are the lateral positions (m) of the lane centres."""
+    2007). `lane_y` (lanes,) are the lateral positions (m) of the lane centres, `half_width` (m) is
+    half the width of the car, and `length` (m) the length of the lap."""
     y, speed, half_length = cars[i, Y_TO], cars[i, SPEED], bodies[i, B_HALF_LENGTH]
     s, desired = cars[i, S], cars[i, DESIRED]
     here = following_acceleration(
@@ -247,10 +248,11 @@ def step_traffic(
     half_width: float,
 ) -> None:
     """Advance all cars by one step of `dt` s. `lane_y` (lanes,) are the lateral positions (m) of
-    the lane centres, `table` is the track's table. `speed_limit` (cells,) in m/s holds in equal
-    parts of the lap.
+    the lane centres, `table` is the track's table, and `length` (m) the length of the lap.
+    `speed_limit` (cells,) in m/s holds in equal parts of the lap. `half_length` and `half_width`
+    (m) are half the size of a car.
 
-    Lane changes are decided one car after the other, based on the earlier decisions. All
+    Lane changes are decided one car after another, based on the earlier decisions. All
     accelerations are computed from the state before the step.
     """
     count = cars.shape[0]

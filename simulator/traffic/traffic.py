@@ -1,8 +1,8 @@
 """Traffic: up to twelve cars in lanes that follow the intelligent driver model.
 
 Cars drive at 40 to 62 km/h, slow down for bends, and change lanes if both gaps are safe and they
-gain acceleration. For them the ego car is a leader or follower like any other car. Track frame: s
-along the centre line, to_middle left positive, m and m/s.
+gain acceleration. They treat the ego car as a leader or follower like any traffic car. Track frame:
+s along the centre line, to_middle left positive, m and m/s.
 """
 
 import math
@@ -117,9 +117,9 @@ class Traffic:
         self._cars[row, car_table.CHANGE_PROGRESS] = 1.0
 
     def set_struck_pose(self, row: int, pose: FloatArray, track_state: FloatArray) -> None:
-        """Set the pose (6,) of a struck car: x, y, z, roll, pitch, yaw of the ground point under
-        it. `track_state` (4,) is s, to_middle, angle (m, rad) and the speed along the track (m/s).
-        Other cars avoid the car's bounding box in the track frame."""
+        """Set the pose (6,) of the struck car `row`: x, y, z, roll, pitch, yaw of the ground point
+        under it. `track_state` (4,) is s, to_middle, angle (m, rad) and the speed along the track
+        (m/s). Other cars avoid the car's bounding box in the track frame."""
         s, to_middle, angle, speed = track_state
         cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
         half_length = 0.5 * (TRAFFIC_CAR_SIZE[0] * cos + TRAFFIC_CAR_SIZE[1] * sin)

@@ -89,7 +89,7 @@ class Wreck:
 
     def update_rest(self) -> None:
         """Set `moving` to whether the car is faster than 0.05 m/s or turns faster than 0.05 rad/s.
-        If it is not, set its velocity to zero."""
+        If `moving` is false, set the velocity and the angular velocity to zero."""
         slow = np.linalg.norm(self.motion[7:10]) < AT_REST_M_S
         self.moving = not (slow and np.linalg.norm(self.motion[10:13]) < AT_REST_RAD_S)
         if not self.moving:

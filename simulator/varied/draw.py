@@ -56,7 +56,9 @@ def draw(tables: Tables, name: str, rng: np.random.Generator) -> Values:
 
 
 def _value(value: Any, drawn: Values, scale: float, rng: np.random.Generator) -> Any:
-    """Return a random value of one entry, written in the notation of ranges.toml."""
+    """Return a random value of one entry, whose `value` is written in the notation of ranges.toml.
+    `drawn` contains the values of earlier entries of the table; colours are multiplied by
+    `scale`."""
     match value:
         case [float(least), float(most)]:
             return rng.uniform(least, most)

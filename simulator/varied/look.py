@@ -73,7 +73,8 @@ class Roadside:
     """Objects close to the road in one scene; see ranges.toml, section [roadside]."""
 
     gap_m: float = -1.0
-    """Least distance from asphalt to barriers; negative: they are drawn where cars hit them."""
+    """Least distance from the asphalt to the drawn barriers; negative: the barriers are drawn where
+    cars hit them."""
     left: str = ""
     """Kind of the barrier on the left of the road (see `camera.scene.barriers`). "": the kinds
     change by section, as in the track's scenery."""

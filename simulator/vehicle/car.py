@@ -63,7 +63,7 @@ class CarParameters:
     bump_travel: float = 0.08
     """Compression beyond rest at which the bump stop begins to act, m."""
     bump_spring: float = 600_000.0
-    """Stiffness of the bump stop, added to that of the spring, N/m."""
+    """Stiffness (N/m) of the bump stop; it adds to the stiffness of the spring."""
 
     wheel_radius: float = 0.3273
     wheel_inertia: float = 1.2
@@ -83,7 +83,8 @@ class CarParameters:
     working_load: float = 1.2
     """Ratio of the load with nominal friction to the static load without fuel."""
     friction_unloaded: float = 1.6
-    """Ratio of friction at zero load to nominal friction; it falls exponentially with the load."""
+    """Ratio of friction at zero load to nominal friction. With increasing load the friction falls
+    exponentially."""
     friction_overloaded: float = 0.8
     """Ratio of friction at infinite load to nominal friction."""
     rolling_resistance: float = 0.001
@@ -111,9 +112,11 @@ class CarParameters:
     """Inertia at the crankshaft, kg m2; fitted to TORCS's 6.3 % larger effective mass in gear 1."""
     idle_rpm: float = 900.0
     limiter_rpm: float = 9152.0
-    """Engine speed above which the engine gives no torque in gear, neither drive nor braking."""
+    """Engine speed (rev/min) above which the engine in gear gives no driving and no braking
+    torque."""
     top_rpm: float = 10_000.0
-    """Engine speed at the end of the torque table; in gear the engine never exceeds it."""
+    """Engine speed (rev/min) at the end of the torque table. In gear the engine never exceeds this
+    speed."""
     torque: tuple[float, ...] = (
         100.0, 160.0, 190.0, 280.0, 350.0, 405.0, 443.0, 465.0, 483.0, 415.0, 360.0,
     )  # fmt: skip
@@ -121,10 +124,10 @@ class CarParameters:
     engine_braking: float = 0.33
     """Ratio of braking torque at closed throttle to full-load torque, at `top_rpm`; 0 at idle."""
     differential_viscosity: float = 30.0
-    """Torque per speed difference of the rear wheels, N m s/rad."""
+    """Torque of the differential per speed difference of the two rear wheels, N m s/rad."""
 
     brake_torque: float = 9_000.0
-    """Torque at full brake, sum of the four wheels, N m; it is enough to lock them."""
+    """Torque at full brake, sum of the four wheels, N m; it is enough to lock the wheels."""
     brake_front_share: float = 0.58
 
     def __post_init__(self) -> None:

@@ -167,7 +167,8 @@ def update_loads(p: Any, velocity: FloatArray, wheels: FloatArray) -> None:
 
 @inlined
 def tyre_slip_gains(p: Any, spin: FloatArray, wheels: FloatArray, slip_gain: FloatArray) -> None:
-    """Fill `slip_gain` (4,): tyre force per m/s of slip speed (N s/m); `spin` (4,) rad/s."""
+    """Fill `slip_gain` (4,): tyre force per m/s of slip speed (N s/m). `spin` (4,) are the wheel
+    speeds (rad/s), `wheels` (4, 20) the rows of the wheels."""
     for wheel in range(4):
         slip_gain[wheel] = tyre_slip_gain(
             p,

@@ -11,7 +11,7 @@ from simulator.world.world import World
 from trackfeatures.camera import CameraParameters
 
 SIZE: Final = (560, 420)
-"""Width and height in px: twice those of the driver view."""
+"""Width and height in px: twice the width and height of the driver view."""
 QUALITY: Final = 82
 
 

@@ -71,8 +71,8 @@ def lend_work(work: Work) -> Work:
 def advance_car(number: int, fleet: Arrays, steps: int, work: Work) -> bool:
     """Advance car `number` by a control step of `steps` physics steps, or until the car touches
     something. Stores the number of physics steps done in the car's column DONE. Returns whether all
-    are done. A car whose column SKIPPED is not 0 is not moved, because it drives among moving
-    wrecks."""
+    physics steps are done. A car whose column SKIPPED is not 0 is not moved, because it drives
+    among moving wrecks. `work` is memory for the steps."""
     cars, params, other, tables, left, right, roads, others, move = fleet
     car = cars[number]
     if car[SKIPPED] != 0.0:

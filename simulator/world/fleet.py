@@ -76,8 +76,8 @@ class Fleet:
         self._update()
 
     def assign(self, number: int, road: Road, car: CarParameters, traffic: int) -> Walls:
-        """Put car `number` with these parameters and room for `traffic` cars on `road`; returns the
-        road's walls."""
+        """Put car `number` with the parameters `car` and room for `traffic` traffic cars on `road`;
+        returns the road's walls."""
         row, _, walls = self._row_of.get(id(road)) or self._add(road)
         self.cars[number] = 0.0
         self.cars[number, [ROAD, TRAFFIC]] = row, traffic

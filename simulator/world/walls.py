@@ -22,7 +22,7 @@ PANEL = (6.0, 3.0, 8.0)
 """Length, thickness and height (m) of a panel."""
 FOOT_M = 3.0  # depth of the panel below the road
 FAR_ALONG_M = 60.0  # parts of the track farther apart than this along s count as separate parts
-MIN_BRIDGE_HEIGHT_M = 4.0  # least height of one road above the other at a bridge
+MIN_BRIDGE_HEIGHT_M = 4.0  # least height of the upper road above the lower road at a bridge
 _STEP_M = 1.0
 _CENTRE_STEP_M = 2.0
 _MIN_RADIUS_M = 1.0  # least distance of a wall from the centre of a bend

@@ -53,7 +53,8 @@ class BridgeBuilder:
         self, size: Point, at: Point, colour: Point, material: float = PLAIN
     ) -> None:
         """Add a closed box of `size` (x, y, z), m, without a shadow, for parts that are too thin to
-        cast a visible shadow. `at` (x, y, z), m, is the middle of the box's floor."""
+        cast a visible shadow. `at` (x, y, z), m, is the middle of the box's floor. `colour` is
+        linear RGB, `material` a material number of `solids`."""
         self._parts.append(box(size, at, colour, material, floor=True))
 
     def shadow_box(self, size: Point, at: Point) -> None:

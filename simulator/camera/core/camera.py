@@ -165,7 +165,7 @@ class Camera:
         *,
         near_s: float | None = None,
     ) -> dict[str, Picture]:
-        """Draw several pictures from one pose; returns them by their names in `views`.
+        """Draw `views` from one pose (arguments as in `render`); returns the pictures by name.
 
         The name of a view (one of VIEWS) requests the colour picture (height, width, 3) uint8 RGB;
         "VIEW:depth" the distance along the optical axis (height, width) float32, m, inf in the sky;

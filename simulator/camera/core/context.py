@@ -256,8 +256,8 @@ def _load_triton_first() -> None:
     """Load triton's library before Mesa's, if triton is installed (about 30 ms, no import).
 
     Mesa makes the symbols of its libLLVM global. If libtriton (part of torch's dependencies) is
-    loaded later, it binds to these symbols and crashes at import; if it is loaded first, it uses
-    its own. A process that draws can then import torch at any time.
+    loaded after Mesa, it binds to Mesa's symbols and crashes at import. If libtriton is loaded
+    first, it uses its own symbols. A process that draws can then import torch at any time.
     """
     if "triton" in sys.modules:
         return

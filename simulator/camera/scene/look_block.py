@@ -37,7 +37,8 @@ def _side_rows(road: Road) -> list[Row]:
 
 
 def _line_rows(road: Road, paint: Paint) -> list[Row]:
-    """Return position and pattern of the lines of all markings, then their colours."""
+    """Return the rows with position and pattern of the lines of all markings, then the rows with
+    the colours of these lines. `paint` is the paint of the scene."""
     assert road.carriageway is not None
     places: list[Row] = [(0.0, -1.0, 0.0, 1.0)] * (MARKINGS * LINES)
     colours: list[Row] = [(0.0, 0.0, 0.0, 0.0)] * (MARKINGS * LINES)

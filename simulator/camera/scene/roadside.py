@@ -66,7 +66,7 @@ def _mixed(one: Colour, other: Colour, share: float) -> Colour:
 
 def parked_cars(road: Road, every_m: float, rng: np.random.Generator) -> FloatArray:
     """Return poses (n, 6; m, rad, world), on the ground, of cars parked along `road`, on each side
-    one every `every_m` (m) on average. They stand on the shoulder if it is at least 2.1 m wide,
+    one every `every_m` (m) on average. They stand on the shoulder if that is at least 2.1 m wide,
     else beside the asphalt if there is room. There are none if `every_m` is 0."""
     if every_m <= 0.0:
         return np.empty((0, 6))

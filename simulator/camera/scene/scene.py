@@ -121,9 +121,9 @@ class Scene:
         )
 
     def draw(self, seen: VisibleScene, labels: bool) -> None:
-        """Draw all opaque parts except the sky, as depth and class if `labels`, else as colours.
-        Parts that are usually near are drawn first, because the depth test then skips hidden
-        pixels."""
+        """Draw all opaque parts of `seen` except the sky, as depth and class if `labels`, else as
+        colours. Parts that are usually near are drawn first, because the depth test then skips
+        hidden pixels."""
         self._block.bind_to_uniform_block(SCENE_BINDING)
         if self._look is not None:
             self._look.bind_to_uniform_block(LOOK_BINDING)
@@ -135,7 +135,7 @@ class Scene:
             self._barriers.draw(seen.barriers, labels)
 
     def draw_blended(self, seen: VisibleScene) -> None:
-        """Draw the transparent parts. Call this after all opaque parts are drawn."""
+        """Draw the transparent parts of `seen`. Call this after all opaque parts are drawn."""
         self._barriers.draw(seen.barriers, labels=False)
         self._trees.draw(seen.trees, "fringe")
 

@@ -116,8 +116,9 @@ def _leaves(
     leaf: float,
     colour: tuple[float, float, float],
 ) -> None:
-    """Draw `count` random discs in each of the elliptic clusters (x, y, rx, ry): dark discs first,
-    then lighter ones, which lie higher. `leaf` is the mean radius as a share of the cell."""
+    """Draw `count` random discs on `canvas` in each of the elliptic `clusters`, given by centre and
+    half axes (x, y, rx, ry) as shares of the cell's side. Dark discs are drawn first, then lighter
+    discs, which lie higher. `leaf` is the mean radius of a disc as a share of the cell's side."""
     base = np.array(colour)
     spots = []
     for x, y, rx, ry in clusters:

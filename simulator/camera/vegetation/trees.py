@@ -1,7 +1,7 @@
 """Draws the nearest visible trees, each as a billboard (a textured quad that faces the camera).
 
-The opaque parts are drawn first, the nearest tree first, so that the depth test skips what they
-hide. The soft edges are blended after everything else, the farthest tree first.
+The opaque parts are drawn first, the nearest tree first, so that the depth test skips what near
+trees hide. The soft edges are blended after everything else, the farthest tree first.
 """
 
 from dataclasses import dataclass

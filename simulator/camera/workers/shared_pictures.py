@@ -25,7 +25,8 @@ class PictureFormat:
 
 
 def create_memory(cars: int, formats: dict[str, PictureFormat]) -> int:
-    """Create zeroed memory for the pictures of `cars` cars. Returns its file descriptor, which the
+    """Create zeroed memory for the pictures of `cars` cars. `formats` contains the format of a
+    car's picture of each view, by the view's name. Returns the memory's file descriptor, which the
     caller must close."""
     descriptor = os.memfd_create("driverview-pictures")
     os.ftruncate(descriptor, sum(_size_bytes(cars, each) for each in formats.values()))
@@ -35,8 +36,8 @@ def create_memory(cars: int, formats: dict[str, PictureFormat]) -> int:
 def map_pictures(
     descriptor: int, cars: int, formats: dict[str, PictureFormat]
 ) -> dict[str, NDArray[Any]]:
-    """Map the memory; returns the pictures (cars, *shape) of each view. They stay valid after the
-    descriptor is closed."""
+    """Map the memory of the file `descriptor`; returns the pictures (cars, *shape) of each view in
+    `formats`. They stay valid after the descriptor is closed."""
     memory = mmap.mmap(descriptor, 0)
     pictures, begin = {}, 0
     for view, each in formats.items():
@@ -48,6 +49,7 @@ def map_pictures(
 
 
 def _size_bytes(cars: int, each: PictureFormat) -> int:
-    """Return the size in bytes of the pictures of one view, rounded up to whole pages."""
+    """Return the size in bytes of `cars` pictures with the format `each`, rounded up to whole pages
+    of memory."""
     size = cars * prod(each.shape) * np.dtype(each.dtype).itemsize
     return -(-size // PAGE_BYTES) * PAGE_BYTES

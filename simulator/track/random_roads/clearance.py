@@ -9,9 +9,9 @@ from simulator.arrays import FloatArray
 from simulator.track.layout import Segment, cut, place
 
 CLEARANCE_M: Final = 24.0
-"""Least distance between the centre lines of two parts of the road. With it, walls up to 12 m from
-the centre line never meet, nor do the inner walls of the tightest bend (12 m). A road of three
-lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
+"""Least distance (m) between the centre lines of two parts of the road. With this distance, walls
+up to 12 m from the centre line never meet, nor do the inner walls of the tightest bend (radius
+12 m). A road of three lanes of 4.3 m with shoulders of 3 m has its walls at 11.95 m."""
 STEP_M: Final = 3.0
 MOST_SAMPLES: Final = 500
 BULGE_M: Final = 0.3
@@ -22,8 +22,8 @@ and a radius of 12 m."""
 def keeps_clear(segments: list[Segment]) -> bool:
     """Return whether the centre lines of all parts of a closed course are at least 24 m apart.
 
-    Points that are less than 12 pi m apart along the road are not compared: they lie in one bend,
-    and no bend's radius is below 12 m.
+    Points that are less than 12 pi m apart along the road are not compared. 12 pi m is half a turn
+    of the tightest bend (radius 12 m), so these points belong to the same part of the road.
     """
     placed = place(cut(segments))
     total = float(placed.s0[-1] + placed.length[-1])

@@ -1,7 +1,7 @@
 """Random roads: the track `random:SEED`, which its seed determines.
 
 The network's angle has its largest errors, and a bias, in tight bends and at changes of curvature.
-Few frames of other tracks show such places; on random roads half of the frames do.
+Few frames of other tracks show these places; on random roads half of the frames show them.
 
 The road is generated as the content of a TOML file (see `toml_track`), in decimals. The same seed
 gives the same decimals on every machine: the random numbers are those of numpy's PCG64, and
@@ -136,8 +136,8 @@ def _read(rows: list[Row]) -> list[Segment]:
 
 
 def _grades(kind: Kind, segments: list[Segment], rng: np.random.Generator) -> list[float]:
-    """Return the grade of each segment in percent. The road lies on hills, so that neighbouring
-    parts have similar heights and the lap closes in height."""
+    """Return the grade of each of `segments` in percent. The road lies on hills, so that
+    neighbouring parts have similar heights and the lap closes in height."""
     placed = place(cut(segments))
     lengths = np.array([segment_length(segment) for segment in segments])
     at = np.concatenate(([0.0], np.cumsum(lengths)))[:-1]

@@ -32,7 +32,8 @@ def surface_and_look(
     name: str, root: Section, main: Section, placed: Placed
 ) -> tuple[Surface, str]:
     """Return the surface and the look (scenery theme) of the track called `name`. `root` is the
-    root section of its file, `main` the section "Main Track"."""
+    root section of its file, `main` the section "Main Track". `placed` gives the heights of the
+    track."""
     surface = _surface(root, main)
     if surface == "gravel":
         return surface, "gravel"

@@ -97,7 +97,8 @@ class Section:
 def _number_in(text: str) -> float:
     """Return the decimal or hexadecimal ("0x1f") number that is all of `text`; NaN for other texts.
 
-    TORCS reads "1,5" and "1.5.2" as far as it can, and an empty text as 0; here they give NaN.
+    TORCS reads "1,5" and "1.5.2" as far as it can, and an empty text as 0. This function returns
+    NaN for these texts.
     """
     found = _NUMBER.fullmatch(text)
     if found is None:
