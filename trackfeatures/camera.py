@@ -21,8 +21,8 @@ COEFFICIENTS: dict[str, tuple[int, ...]] = {"none": (0,), "opencv": (4, 5, 8), "
 
 
 class CameraError(UserError, ValueError):
-    """Raised for impossible camera parameters; a ValueError, which readers of damaged files
-    catch."""
+    """Raised for impossible camera parameters. It is also a ValueError, because the code that reads
+    files catches ValueErrors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,15 +140,16 @@ class CameraParameters:
         return project(self, away @ self.rotation().T)
 
     def rays(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
-        """Return the ray directions (N, 3), with z = 1, of pixels (N, 2) in the camera's frame. NaN
-        where the lens model maps no ray to the pixel."""
+        """Return the ray directions (N, 3), with z = 1, of pixels (N, 2) in the camera's frame. The
+        direction is NaN for a pixel to which the lens model maps no ray."""
         from trackfeatures.lens import rays
 
         return rays(self, pixels)
 
     def road_points(self, pixels: "ArrayLike") -> "NDArray[np.float64]":
         """Return the points (N, 2) in m on a flat road that pixels (N, 2) show: x ahead and y left
-        of the point below the centre of gravity. NaN for pixels on or above the horizon."""
+        of the point below the centre of gravity. Points are NaN for pixels on or above the
+        horizon."""
         import numpy as np
 
         ahead, left, up = (self.rays(pixels) @ self.rotation()).T
@@ -157,8 +158,9 @@ class CameraParameters:
         return np.column_stack([self.x + far * ahead, self.y + far * left])
 
     def homography(self, other: "CameraParameters") -> "NDArray[np.float64]":
-        """Return the homography (3, 3) from pixels of this camera to pixels of `other`. It is exact
-        if both are in one place and have no distortion (Hartley and Zisserman 2004, 8.4)."""
+        """Return the homography (3, 3) from pixels of this camera to pixels of the camera `other`.
+        It is exact if both cameras have the same position and no distortion (Hartley and Zisserman
+        2004, 8.4)."""
         import numpy as np
 
         turn = other.rotation() @ self.rotation().T
@@ -170,7 +172,8 @@ class CameraParameters:
         return replace(self, distortion="none", coefficients=())
 
     def resized(self, width: int, height: int) -> "CameraParameters":
-        """Return the camera of images scaled to `width` x `height` px, of any aspect ratio."""
+        """Return the camera whose images are the images of this camera, scaled to `width` x
+        `height` px. The aspect ratio may change."""
         if self.matrix is None and width * self.height == height * self.width:
             return replace(self, width=width, height=height)
         x, y = width / self.width, height / self.height

@@ -22,7 +22,8 @@ IN_LANE_WIDTH_LIMIT_M = 5.5
 ON_MARKING_LIMIT_M = 2.75
 """When values are decoded, `m` is present if its value is below this limit."""
 NEIGHBOUR_LIMIT_M = 6.75
-"""When values are decoded, `l` and `r` are present if `m` is and they are within this limit."""
+"""When values are decoded, `l` or `r` is present if `m` is present and the absolute value of `l` or
+`r` is below this limit."""
 
 _LO = np.array([RANGES[name].lo for name in TARGETS])
 _WIDTH = np.array([RANGES[name].hi - RANGES[name].lo for name in TARGETS])
@@ -44,7 +45,8 @@ def encode(distances: ArrayLike, angle: ArrayLike) -> NDArray[np.float32]:
 
 
 def decode_values(coded: ArrayLike) -> NDArray[np.float64]:
-    """Return the values (N, 6) in m and rad of `coded` (N, 6), without detecting absence."""
+    """Return the values (N, 6) in m and rad of `coded` (N, 6). An absent distance is not detected:
+    its value is an end of its range."""
     y = np.atleast_2d(np.asarray(coded, dtype=np.float64))
     values: NDArray[np.float64] = _LO + (y - OFFSET) / SPAN * _WIDTH
     return values
@@ -89,7 +91,8 @@ def mirror_coded(coded: ArrayLike) -> NDArray[np.float32]:
 
 
 def mirror_heading(heading: ArrayLike) -> NDArray[np.int64]:
-    """Return the classes (N,) of the left-right mirrored scenes: LEFT and RIGHT are swapped."""
+    """Return the classes (N,) of the left-right mirrored scenes: LEFT and RIGHT are swapped, and
+    unknown classes (UNKNOWN_HEADING) stay unknown."""
     classes = np.asarray(heading, dtype=np.int64)
     return np.where(classes == UNKNOWN_HEADING, classes, RoadClass.RIGHT - classes)
 

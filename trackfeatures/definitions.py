@@ -17,8 +17,8 @@ VERSION: Final = "2"
 """Version of these definitions; stored in every recording, model and answer."""
 
 MARKINGS: Final = ("ml", "mr", "l", "m", "r")
-"""In-lane system: `ml`, `mr`, the markings of the car's lane. On-marking system: `m`, the marking
-that the car drives on; `l`, `r`, the next markings to the left and right of `m`."""
+"""In-lane system: `ml` and `mr` are the markings of the car's lane. On-marking system: `m` is the
+marking nearest to the car; `l` and `r` are the next markings to the left and right of `m`."""
 
 TARGETS: Final = (*MARKINGS, "angle")
 """The six regression targets of a network, in the order of its outputs."""
@@ -28,11 +28,12 @@ LANE_WIDTH_M: Final = 4.0
 LANE_WIDTH_LIMITS_M: Final = (2.7, 4.5)
 
 IN_LANE_MARGIN_M: Final = 0.5
-"""The in-lane system is active if the car is at least this far from both of its lane's markings."""
+"""The in-lane system is active if the car is at least this far from both markings of its lane."""
 ON_MARKING_REACH_M: Final = 1.2
-"""The on-marking system is active within this distance of a marking."""
+"""The on-marking system is active if the car is at most this far from a marking."""
 OUTSIDE_REACH_M: Final = 2.0
-"""Reach of the on-marking system on the outer side of an outermost marking."""
+"""The on-marking system is also active if the car is at most this far outside the outermost
+marking."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +64,8 @@ class TrackFeatures:
     """The track features of one image or one moment."""
 
     ml: float | None
-    """Distance to the marking `ml` in m, negative left of the car; None if it is absent. The next
-    four fields are distances of the same kind."""
+    """Distance from the car to the marking `ml` in m, negative if the marking is left of the car;
+    None if it is absent. `mr`, `l`, `m` and `r` are distances with the same unit and sign."""
     mr: float | None
     l: float | None
     m: float | None
@@ -88,11 +89,12 @@ class TrackFeatures:
 def lane_offset(
     ml: float | None, mr: float | None, l: float | None, m: float | None, r: float | None
 ) -> float | None:
-    """Return the offset from the centre of the nearest lane (m, left positive); None if no lane is
-    visible.
+    """Return the car's offset from the centre of the nearest lane (m, left positive); None if no
+    lane is visible.
 
-    The pair `ml`, `mr` has priority. Without this pair, the lane on the car's side of the marking
-    `m` is used. Outside the road there is no lane on this side, so the lane beyond `m` is used.
+    The arguments are the fields of `TrackFeatures`. The pair `ml`, `mr` has priority. Without this
+    pair, the lane on the car's side of the marking `m` is used. If the car is outside the road,
+    there is no lane on this side, so the lane on the far side of `m` is used.
     """
     if ml is not None and mr is not None:
         return (ml + mr) / 2

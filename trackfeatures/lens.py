@@ -1,9 +1,9 @@
 """Projection through a lens and its inverse, in the camera's frame: x right, y down, z ahead.
 
 Distortion is OpenCV's pinhole model (k1, k2, p1, p2, k3 to k6: calib3d's documentation; Brown 1966)
-or OpenCV's fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). A model
-is used only up to the angle at which the distorted radius stops growing; rays at larger angles are
-not projected.
+or OpenCV's fisheye model (k1 to k4 over the angle from the axis: Kannala and Brandt 2006). A
+distortion model is used only up to the angle at which the distorted radius stops growing; rays at
+larger angles are not projected.
 """
 
 from functools import lru_cache
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from trackfeatures.camera import CameraParameters
 
 MAX_ANGLE_RAD = pi / 2 - 1e-3
-"""Largest angle between ray and optical axis; below pi/2, as rays are scaled to z = 1."""
+"""Largest angle between a ray and the optical axis. It is below pi/2, because rays are scaled to
+z = 1."""
 TABLE = 4096  # number of angles in the table that inverts the radius
 STEPS = 8  # largest number of Newton steps; three steps give an error below 1e-12
-CONVERGED = 1e-10  # error in units of the focal length
+CONVERGED = 1e-10  # largest error of an undistorted point, in units of the focal length
 
 FloatArray = NDArray[np.float64]
 
@@ -116,7 +117,8 @@ def _distort(camera: "CameraParameters", flat: FloatArray) -> tuple[FloatArray, 
 def _fisheye_scale(
     square: FloatArray, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the distorted radius / r, and its derivative by r^2, for `square` = r^2 (N,)."""
+    """Return the ratio (N,) of the distorted radius to the undistorted radius r at z = 1, and the
+    derivative (N,) of this ratio with respect to r^2, for `square` = r^2 (N,)."""
     r = np.sqrt(square)
     small = r < 1e-4
     safe = np.where(small, 1.0, r)
@@ -134,12 +136,14 @@ def _padded(coefficients: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _rational(k: tuple[float, ...]) -> tuple[list[float], list[float]]:
-    """Return numerator and denominator of OpenCV's model in r^2, highest power first."""
+    """Return numerator and denominator of the radial factor of OpenCV's model, as polynomials in
+    r^2, highest power first. `k` has the eight coefficients."""
     return [k[4], k[1], k[0], 1.0], [k[7], k[6], k[5], 1.0]
 
 
 def _angle_polynomial(coefficients: tuple[float, ...]) -> list[float]:
-    """Return the distorted fisheye radius as a polynomial of the angle, highest power first."""
+    """Return the distorted radius of the fisheye model as a polynomial of the angle from the axis,
+    highest power first."""
     k1, k2, k3, k4 = coefficients
     return [k4, 0.0, k3, 0.0, k2, 0.0, k1, 0.0, 1.0, 0.0]
 
@@ -169,7 +173,8 @@ def _positive_roots(polynomial: NDArray[np.floating[Any]]) -> list[float]:
 
 @lru_cache(maxsize=64)
 def _radius_table(kind: str, coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return angles from the axis (TABLE,) in rad up to `angle_limit`, and distorted radii."""
+    """Return angles from the axis (TABLE,) in rad up to `angle_limit`, and the distorted radii
+    (TABLE,) at these angles."""
     angles = np.linspace(0.0, angle_limit(kind, coefficients), TABLE)
     if kind == "fisheye":
         return angles, np.asarray(np.polyval(_angle_polynomial(coefficients), angles), np.float64)

@@ -23,8 +23,9 @@ from trackfeatures.errors import UserError
 from trackfeatures.road_class import LOOK_AHEAD_M, classify_heading
 
 LineOffsets = Sequence[tuple[float, float]]
-"""For each marking two offsets from its nominal position in m, left positive: that of the line that
-bounds the lane to its left, and that of the line that bounds the lane to its right."""
+"""Two offsets for each marking, in m from the nominal position of the marking, left positive: first
+the offset of the line that bounds the lane left of the marking, then the offset of the line that
+bounds the lane right of the marking."""
 LEFT_LANE, RIGHT_LANE = range(2)
 _ONE_LINE: LineOffsets = ((0.0, 0.0),) * (max(LANES) + 1)
 
@@ -42,7 +43,7 @@ class CentreLine(Protocol):
 
 
 def check_lanes(lanes: int, lane_width_m: float) -> None:
-    """Raises UserError unless the definitions cover this number of lanes and this lane width."""
+    """Raises UserError unless `lanes` is 1, 2 or 3 and `lane_width_m` is 2.7 to 4.5 m."""
     if lanes not in LANES:
         raise UserError(f"a road of {lanes} lanes is not supported; give 1, 2 or 3")
     lo, hi = LANE_WIDTH_LIMITS_M
@@ -51,18 +52,21 @@ def check_lanes(lanes: int, lane_width_m: float) -> None:
 
 
 def marking_offsets(lanes: int, lane_width_m: float) -> NDArray[np.float64]:
-    """Return the lateral positions (lanes + 1,) of the markings in m, leftmost first."""
+    """Return the lateral positions (lanes + 1,) of the markings in m left of the road's centre
+    line, leftmost first."""
     return lane_width_m * (lanes / 2 - np.arange(lanes + 1, dtype=np.float64))
 
 
 def lane_index(to_middle: float, lanes: int, lane_width_m: float) -> int:
-    """Return the index of the lane that the car is in or nearest to; 0 is the leftmost lane."""
+    """Return the index of the lane that the car is in or nearest to; 0 is the leftmost lane. The
+    car is `to_middle` m left of the centre line of the road."""
     lane = math.floor(lanes / 2 - to_middle / lane_width_m)
     return min(max(lane, 0), lanes - 1)
 
 
 def lane_centre(index: int, lanes: int, lane_width_m: float) -> float:
-    """Return the lateral position of the centre of lane `index` (m, left positive)."""
+    """Return the lateral position of the centre of lane `index` (m left of the road's centre line);
+    lane 0 is the leftmost lane."""
     return lane_width_m * (lanes / 2 - index - 0.5)
 
 
@@ -83,8 +87,10 @@ def measure(
     """Return the features of a car `to_middle` m left of the centre line, at `angle` (rad) to the
     road.
 
-    `line_offsets` (see `LineOffsets`) is needed for double lines, where the nearer line bounds each
-    adjacent lane. Without it every line is at the nominal position of its marking.
+    `curvature` and `curvature_ahead` (1/m, left positive) are the road's curvatures at the car and
+    20 m ahead of the car. `line_offsets` (see `LineOffsets`) is needed for double lines, where the
+    nearer line bounds each adjacent lane. Without `line_offsets` every line is at the nominal
+    position of its marking.
     """
     offsets = line_offsets or _ONE_LINE
     ml, mr = in_lane_distances(to_middle, lanes, lane_width_m, offsets)
@@ -96,7 +102,8 @@ def measure(
 def measure_pose(
     centre_line: CentreLine, x: float, y: float, yaw: float, lanes: int, lane_width_m: float
 ) -> TrackFeatures:
-    """Return the features of a car at (x, y) in m with `yaw` in rad (counter-clockwise)."""
+    """Return the features of a car at (x, y) in m with `yaw` in rad (counter-clockwise), on a road
+    with `lanes` lanes around `centre_line`. Raises the errors of `check_lanes`."""
     check_lanes(lanes, lane_width_m)
     s, to_middle = centre_line.project(x, y)
     angle = wrap_angle(centre_line.heading(s) - yaw)
@@ -107,8 +114,8 @@ def measure_pose(
 def in_lane_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float, float] | tuple[None, None]:
-    """Return `ml` and `mr` (m), or (None, None) if the in-lane system is inactive. The simulator
-    also compiles this function."""
+    """Return `ml` and `mr` (m), or (None, None) if the car is less than 0.5 m from one of these
+    markings. `offsets` are `LineOffsets`. The simulator also compiles this function with numba."""
     lane = lane_index(to_middle, lanes, lane_width_m)
     beside = to_middle - lane_centre(lane, lanes, lane_width_m)
     ml = beside - lane_width_m / 2 - offsets[lane][RIGHT_LANE]
@@ -120,8 +127,9 @@ def in_lane_distances(
 def on_marking_distances(
     to_middle: float, lanes: int, lane_width_m: float, offsets: LineOffsets
 ) -> tuple[float | None, float | None, float | None]:
-    """Return `l`, `m` and `r` (m). A distance to a marking that does not exist is None; all are
-    None if the on-marking system is inactive."""
+    """Return `l`, `m` and `r` (m). A distance to a marking that does not exist is None. All three
+    are None if no marking is near: within 1.2 m of the car, or within 2 m of a car outside the
+    road. `offsets` are `LineOffsets`."""
     # Markings are numbered from 0 (leftmost) to `lanes` (rightmost).
     nearest = min(max(round(lanes / 2 - to_middle / lane_width_m), 0), lanes)
     place = to_middle - lane_width_m * (lanes / 2 - nearest)
@@ -136,8 +144,9 @@ def on_marking_distances(
 
 
 def localise(distances: ArrayLike) -> NDArray[np.float64]:
-    """Return the offsets (N,) in m from the centre of the nearest lane, left positive, of
-    `distances` (N, 5) in m (NaN: absent); NaN if no lane is visible."""
+    """Return the offsets (N,) in m of the car from the centre of the nearest lane, left positive,
+    for `distances` (N, 5) in m (ml, mr, l, m, r; NaN: absent). The offset is NaN if no lane is
+    visible."""
     rows = np.atleast_2d(np.asarray(distances, dtype=np.float64)).tolist()
     present = ((None if math.isnan(d) else d for d in row) for row in rows)
     offsets = (lane_offset(*row) for row in present)

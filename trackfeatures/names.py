@@ -18,8 +18,8 @@ class BadName(UserError, ValueError):
 
 
 def is_name(value: object) -> bool:
-    """Return whether `value` is a text of 1 to 128 ASCII letters, digits, `.`, `_` or `-`, but not
-    `.` or `..`."""
+    """Return whether `value` is a text of 1 to 128 characters, each an ASCII letter, a digit, `.`,
+    `_` or `-`, and is neither `.` nor `..`."""
     return isinstance(value, str) and NAME.fullmatch(value) is not None and value not in (".", "..")
 
 

@@ -11,8 +11,8 @@ LOOK_AHEAD_M: Final = 20.0
 
 
 class RoadClass(IntEnum):
-    """The direction in which the road ahead bends. It is the third task of the paper's network,
-    which calls it the heading. Files, messages and answers use the name `heading`."""
+    """The direction in which the road ahead bends: the third task of the network of Li et al. (see
+    `definitions`), who call it the heading. Files, messages and answers use the name `heading`."""
 
     LEFT = 0
     STRAIGHT = 1

@@ -1,4 +1,5 @@
-"""The paper's state vector (7,) of car and road, the input of its controllers."""
+"""The state vector (7,) of car and road that the controllers of Li et al. (see `definitions`)
+receive."""
 
 import math
 
@@ -14,10 +15,11 @@ SPEED_SCALE_M_S = 75.0 / 3.6
 def state_vector(
     offset: float, angle: float, vx: float, vy: float, heading: RoadClass, half_width: float
 ) -> NDArray[np.float64]:
-    """Return (7,): offset / half of the track's width, angle / pi, vx and vy / 75 km/h, and the
+    """Return the vector (7,): offset / half_width, angle / pi, vx / 75 km/h, vy / 75 km/h, and the
     class of the road one-hot (left, straight, right).
 
-    `offset` and `half_width` are in m, `angle` in rad, `vx` and `vy` in m/s.
+    `offset` is the car's lateral offset (m, left positive), `half_width` half of the track's width
+    (m), `angle` the heading angle (rad), and `vx` and `vy` are the car's speeds (m/s).
     """
     vector = np.zeros(STATE_SIZE)
     vector[0], vector[1] = offset / half_width, angle / math.pi
