@@ -66,11 +66,11 @@ def is_loopback(host: str) -> bool:
 
 
 class HostNames:
-    """The host names that a service accepts: loopback names and addresses, and the given names."""
+    """The host names that a service accepts in the headers Host and Origin of a request."""
 
     def __init__(self, names: Iterable[str], *, any_name: bool) -> None:
-        """Accept the Host names `names`; `any_name` accepts every Host, for a service that requires
-        a token from each client."""
+        """Accept `names` in addition to the loopback names and addresses. With `any_name` every
+        Host is accepted; use it only for a service that requires a token from each client."""
         found = (host_name(name.encode("latin-1", "replace")) for name in names)
         self._names = {name for name in found if name is not None}
         self._any_name = any_name
@@ -88,11 +88,12 @@ class HostNames:
         return is_loopback(name) or name in self._names or (self._any_address and _is_ip(name))
 
     def allow_origin(self, origin: bytes, host: bytes) -> bool:
-        """Whether a request with this Origin is accepted: the service's own origin (equal to Host),
-        or an accepted name, since a proxy can change Host.
+        """Whether a request with this Origin is accepted. `origin` must be the service's own origin
+        (its host and port equal the header `host`), or contain one of the names given to this
+        object, because a proxy can change the header Host.
 
-        Other origins are refused: a page of another site could send requests through the browser of
-        a user who can reach this service.
+        All other origins are refused: a page of another site could send requests through the
+        browser of a user who can reach this service.
         """
         scheme, separator, place = origin.lower().partition(b"://")
         if not (separator and scheme in (b"http", b"https") and place):

@@ -1,7 +1,8 @@
 """Reads camera files in YAML (our format, OpenCV, ROS, Kalibr) as `CameraParameters`; writes ours.
 
 Our format has the fields of `CameraParameters`, with `height_above_road_m` in place of `z`. The
-other formats describe image size and lens; the keys of our format for the mount can be added.
+other formats describe only image size and lens. A file in one of them may also have the keys of our
+format for the mount.
 """
 
 import re
@@ -26,7 +27,8 @@ NOT_ASSUMED: dict[str, Any] = {
     "coefficients": (),
     "height_std": 0.0,
 }
-"""Values of these fields if a file omits them. Other omitted fields keep the default camera's."""
+"""Values of these fields if a file omits them. Any other field that a file omits has the value of
+the default camera."""
 LIMITS_DEG = {"pitch_deg": 30.0, "roll_deg": 30.0, "yaw_deg": 180.0}
 MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "k", "mtx")
 COEFFICIENT_KEYS = (
@@ -45,10 +47,10 @@ MODELS = {
     "kannala_brandt": "fisheye",
 }
 """Names of distortion models in files, each with its name in `CameraParameters`."""
-MAX_SKEW = 1e-3  # as a fraction of the focal length
+MAX_SKEW = 1e-3  # largest accepted skew of a camera matrix, as a fraction of the focal length
 
 Note = Callable[[str], None]
-"""Called with a line of text for the user."""
+"""A function that is called with a line of text for the user."""
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
@@ -69,9 +71,9 @@ def read_camera(
 ) -> CameraParameters:
     """Read the camera in a file of our format, OpenCV, ROS `camera_info` or Kalibr's camchain.
 
-    Size, mount and field of view come from `default` if the file omits them; the default lens is a
-    pinhole. `note` is called with a line about chosen or assumed values. Raises UserError with a
-    one-line message for a faulty file.
+    Size, mount and field of view come from `default` if the file omits them. If the file describes
+    no lens, the lens is a pinhole. `note` is called with a line about the values that were chosen
+    or assumed. Raises UserError with a one-line message for a faulty file.
     """
     content = _load(path)
     try:
@@ -116,8 +118,8 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _values(content: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The kind of a file with this content ("" for our format), and the fields of the camera that
-    it gives."""
+    """Return the kind of a camera file with the YAML content `content` ("" for our format), and the
+    fields of `CameraParameters` that the file contains."""
     if cameras := sorted(str(key) for key in content if re.fullmatch(r"cam\d+", str(key))):
         others = f" of {', '.join(cameras)}" if len(cameras) > 1 else ""
         return f"{cameras[0]}{others} of a Kalibr camchain", _kalibr(content, cameras[0])
@@ -214,7 +216,8 @@ def read_distortion(model: Any, given: list[float]) -> dict[str, Any]:
 
 
 def _plain(content: dict[str, Any], keys: Any) -> dict[str, Any]:
-    """Read the numbers that the file has under `keys`, by field of `CameraParameters`."""
+    """Return the numbers that `content` has under `keys`, by the names of the fields of
+    `CameraParameters`. Keys that `content` does not contain are left out."""
     if HEIGHT in content and "z" in content:
         raise CameraError(f"the file has both z and {HEIGHT}; leave one out")
     values: dict[str, Any] = {}
@@ -247,8 +250,8 @@ def _number(name: str, value: Any) -> float:
 
 
 def _numbers(name: str, value: Any) -> list[float]:
-    """The numbers in a list, a list of rows, or a matrix of OpenCV or ROS, as one flat list. Raises
-    CameraError for anything else; `name` is the key, for the message."""
+    """Return the numbers in `value`, which is a list, a list of rows, or a matrix of OpenCV or ROS,
+    as one flat list. Raises CameraError for anything else; `name` is the key, for the message."""
     if isinstance(value, dict):
         data = value.get("data")
         if data is None:

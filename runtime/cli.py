@@ -47,7 +47,7 @@ def main(app: Callable[[], object]) -> None:
 
 
 def fail(message: str) -> None:
-    """Write the error line to stderr and exit with code 1."""
+    """Write the line `error: MESSAGE` to stderr and exit with code 1."""
     sys.stderr.write(f"error: {printable(message)}\n")
     sys.exit(FAILED)
 
@@ -58,8 +58,8 @@ def print_result(content: dict[str, Any], as_json: bool, line: str) -> None:
 
 
 def progress_bar() -> "Progress":
-    """Create a progress bar on stderr with "done/total"; it is erased when its `with` block
-    ends."""
+    """Create a progress bar on stderr that shows the number done and the total number ("3/10"). It
+    is erased when its `with` block ends."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
@@ -69,8 +69,8 @@ def progress_bar() -> "Progress":
 
 @contextmanager
 def progress(text: str = "") -> Iterator[Callable[..., None]]:
-    """Show a progress bar with `text`. Yields a function that updates it; its arguments are the
-    number done, the total number and, if it changes, the text."""
+    """Show a progress bar with `text`. Yields a function that updates the bar. The arguments of the
+    function are the number done, the total number and, optionally, a new text."""
     from rich.markup import escape
 
     with progress_bar() as bar:
@@ -94,7 +94,7 @@ def _printable(character: str) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return the number and the noun, in the plural if needed: "1 round", "2 rounds"."""
+    """Return `count` and `noun` as text, with an "s" unless `count` is 1: "1 round", "2 rounds"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -1,4 +1,5 @@
-"""Writes files atomically (the old file stays until the new one is complete); locks; file names.
+"""Writes files atomically (the old file stays until the new one is complete), locks folders, and
+converts file names.
 
 A file name can contain any bytes. `os.fsdecode` turns bytes that are not UTF-8 into surrogates, and
 text files get surrogates as escapes: the Latin-1 name `caf\\xe9.jpg` becomes `caf\\udce9.jpg`.
@@ -27,7 +28,7 @@ def natural_key(name: str) -> tuple[list[str | tuple[int, str]], str]:
     A run of ASCII digits is a number; other digits, signs and decimal points are text.
     """
     parts: list[str | tuple[int, str]] = list(re.split("([0-9]+)", name.casefold()))
-    for place in range(1, len(parts), 2):  # every second part is a number; too long for int()
+    for place in range(1, len(parts), 2):  # every second part has digits, too many for int()
         digits = str(parts[place]).lstrip("0")
         parts[place] = (len(digits), digits)
     return parts, name
@@ -79,7 +80,7 @@ def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> No
 
     If writing fails (a full disk, a power cut) the old file stays. `fsync` waits until the data
     and the new name are on the disk. Raises UserError if the folder is missing, and OSError with
-    the file's name.
+    the file's name if writing fails.
     """
     check_folder(path)
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
@@ -115,7 +116,7 @@ def unfinished_path(path: Path) -> Path:
 
 
 def atomic_move(source: Path, target: Path) -> None:
-    """Write a finished file or folder to the disk (fsync), then rename it.
+    """Write the finished file or folder `source` to the disk (fsync), then rename it to `target`.
 
     After a power cut `target` is complete or does not exist. Raises OSError.
     """
@@ -127,10 +128,11 @@ def atomic_move(source: Path, target: Path) -> None:
 
 @contextmanager
 def replaced_files(folder: Path, last: str) -> Iterator[Path]:
-    """Yield a temporary folder; its files replace those in `folder` if the block raises no error.
+    """Yield a temporary folder. At the end of the `with` block its files replace the files of the
+    same names in `folder`, unless the block raises an error.
 
     The file named `last` describes the other files. It is deleted before the first replacement and
-    written after the last one, so if it exists, all files belong together. Raises OSError.
+    written after the last replacement, so if it exists, all files belong together. Raises OSError.
     """
     staged = folder / STAGED
     shutil.rmtree(staged, ignore_errors=True)  # left by a killed process
@@ -151,7 +153,8 @@ def replaced_files(folder: Path, last: str) -> Iterator[Path]:
 def try_lock(descriptor: int, *, shared: bool = False) -> bool:
     """Lock an open file or folder until it is closed or the process ends (`flock`).
 
-    Returns False if another process holds a lock on it (with `shared`: an exclusive lock).
+    The lock is exclusive, or shared with `shared`. Returns False if another process holds a lock
+    that excludes it: any lock, or with `shared` an exclusive lock.
     """
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
@@ -162,7 +165,7 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Lock the folder within the context. The lock also ends if the process ends.
+    """Lock `folder` exclusively while the context lasts. The lock also ends if the process ends.
 
     Raises UserError if another process holds the lock.
     """

@@ -16,10 +16,11 @@ BOX_HEAD = 8
 
 
 class Mp4Writer:
-    """Writes a film of `fps` images per second, which can be played even after an interruption.
+    """Writes a film of `fps` images per second to the file `path`.
 
     The first image sets the film's size. Use the writer as a context manager, which closes the
-    file. Raises UserError if the file cannot be written, at the latest when it is closed.
+    file; the film can also be played if an error or Ctrl-C ended the `with` block early. Raises
+    UserError if the file cannot be written, at the latest when it is closed.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -59,10 +60,11 @@ def _is_complete(path: Path) -> bool:
 
 
 def boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Yield (type, start of the content, end) of each box of an MP4 file from byte `start` to
-    `end`.
+    """Yield (type, first byte of the content, end) of each box of an MP4 file between the bytes
+    `start` and `end`. Positions are in bytes from the begin of the file.
 
-    The last box can end beyond `end`; bytes that are no box end the list. Source: ISO 14496-12.
+    The last box can end beyond `end`. The iteration stops at bytes that are no box. Source: ISO
+    14496-12.
     """
     while start + BOX_HEAD <= end:
         file.seek(start)

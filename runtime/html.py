@@ -44,7 +44,7 @@ def format_percent(share: float | None, digits: int = 1) -> str:
 
 
 def data_uri(content: bytes, media_type: str = "image/jpeg") -> str:
-    """Return a `data:` URI with the content of a file."""
+    """Return a `data:` URI that contains `content`, the bytes of a file of type `media_type`."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
 
 

@@ -26,8 +26,9 @@ from numba.extending import intrinsic, register_jitable
 
 OWN_MODE = 0o700
 CONTAINED = {"controllers": ("simulator",)}
-"""Maps a package to the packages whose functions and constants its compiled code contains. Compiled
-code can always contain those of `trackfeatures`."""
+"""Maps a package to the packages whose functions and constants its compiled code contains. The
+package `trackfeatures` is not listed, because the code of every package can contain its
+functions."""
 UNUSED_DAYS = 30.0  # after this time, unused machine code of other source versions is deleted
 
 
@@ -40,7 +41,8 @@ def code_folder(name: str, *packages: Path) -> Path:
     deleted.
 
     numba unpickles and executes the files of this folder, so only this user must be able to write
-    to it. A temporary folder needs a random name: another user could create a predictable one.
+    to it. A temporary folder gets a random name, because another user could create a folder with a
+    predictable name first.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -64,8 +66,9 @@ def code_folder(name: str, *packages: Path) -> Path:
 
 
 def _make_own(folder: Path) -> bool:
-    """Create `folder`, or make an existing one accessible only for this user. Returns False if it
-    is a link, belongs to another user or is not writable."""
+    """Create `folder`, or make an existing folder accessible only for this user. Returns False if
+    `folder` is a link, belongs to another user or is not writable. An existing folder in which
+    other users could write is emptied."""
     with suppress(FileExistsError):
         folder.mkdir(mode=OWN_MODE)
     found = folder.lstat()
@@ -94,7 +97,8 @@ Item = TypeVar("Item")
 
 @functools.cache
 def _cache_folder(package: str) -> str:
-    """The folder for the machine code of a package, chosen when its first function is decorated."""
+    """Return the folder for the machine code of a package. It is chosen when the first function of
+    the package is decorated."""
     # numba's Cache.__init__ reads the folder at decoration, so the first call would be too late.
     names = (package, *CONTAINED.get(package, ()), "trackfeatures")
     specs = [cast(ModuleSpec, find_spec(name)) for name in names]
@@ -139,9 +143,10 @@ def _borrow(typing_context: Any, array: Any) -> Any:
 
 
 borrowed: Borrow = cast(Any, intrinsic(_borrow))
-"""Returns, in compiled code, the same array without reference counting. With counting, each view of
-the array causes atomic operations, which take longer than the arithmetic of a small function. Use
-`borrowed` on arguments only: the caller holds them until the function returns."""
+"""Returns, in compiled code, the same array without reference counting. With reference counting,
+each view of the array causes atomic operations, which take longer than the arithmetic of a small
+function. Use `borrowed` only on arguments of a function: its caller keeps them alive until the
+function returns."""
 
 
 def inlined(function: Function) -> Function:

@@ -1,6 +1,7 @@
 """Makes command-line options of the fields of a dataclass, so that each option is declared once.
 
-The type of such a field contains the option: `size: Annotated[int, Option(help="...")] = 32`.
+A field becomes an option if its type contains a Typer option, for example
+`size: Annotated[int, Option(help="...")] = 32`.
 """
 
 from collections.abc import Callable
@@ -18,9 +19,10 @@ def options_of(
 ) -> Callable[[Command], Command]:
     """Return a decorator that adds the options of the dataclass `config` to a command.
 
-    The first argument of the command is an instance of `config`, or the result of `make` called
-    with the options' values (`dict` if the command computes other fields itself). With `only_given`
-    it is a dictionary of the options that the user gave; the help shows the dataclass's defaults.
+    The first argument of the command is an instance of `config`, or, if `make` is given, the result
+    of `make` called with the options' values. `make` is `dict` if the command computes fields that
+    are no options itself. With `only_given` the first argument is a dictionary of the options that
+    the user gave; the help text shows the dataclass's defaults.
     """
     types = get_type_hints(config, include_extras=True)
     added = [
@@ -50,8 +52,8 @@ def options_of(
 
 
 def _parameter(field: Field[Any], type_: Any, only_given: bool) -> Parameter:
-    """The field as a parameter of a Typer command. An option with a parser has the type `str`; with
-    `only_given` the default is None (False for a flag)."""
+    """Return `field`, whose type is `type_`, as a parameter of a Typer command. An option with a
+    parser has the type `str`. With `only_given` the default is None (False for a flag)."""
     kind, option = get_args(type_)
     default = Parameter.empty if field.default is MISSING else field.default
     if getattr(option, "parser", None) is not None:

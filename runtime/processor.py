@@ -1,7 +1,8 @@
-"""Finds out whether this processor has instructions for bf16 and for int8 numbers; without them, a
-network in these formats is slow.
+"""Finds out whether this processor has instructions for bf16 and for int8 numbers. Without these
+instructions a network in these formats is slow.
 
-The flags in /proc/cpuinfo show it. On systems other than Linux no format counts as native.
+The instructions are listed as flags in /proc/cpuinfo. On systems other than Linux this file does
+not exist, so the processor counts as having none of them.
 """
 
 from functools import cache
@@ -10,8 +11,9 @@ from pathlib import Path
 CPUINFO = Path("/proc/cpuinfo")
 BF16_FLAGS = {"avx512_bf16", "amx_bf16", "bf16"}
 INT8_FLAGS = {"avx512_vnni", "avx_vnni", "avx_vnni_int8", "amx_int8", "i8mm", "asimddp"}
-"""Flags of instructions that sum products of 8-bit numbers in 32 bits. Without them, an x86
-processor saturates sums of two products at 16 bits. ARM: `i8mm` and `asimddp` (dot products)."""
+"""Flags of instructions that sum products of 8-bit numbers in 32 bits. Without these instructions
+an x86 processor saturates sums of two products at 16 bits. `i8mm` and `asimddp` (dot products) are
+flags of ARM processors."""
 
 
 def has_bf16() -> bool:
@@ -26,8 +28,8 @@ def has_int8() -> bool:
 
 @cache
 def flags(cpuinfo: Path) -> frozenset[str]:
-    """Return the flags (x86) or features (ARM) of the first processor in the file `cpuinfo`; empty
-    if there is no such file."""
+    """Return the flags (x86) or features (ARM) of the first processor in the file `cpuinfo`, or an
+    empty set if this file does not exist."""
     if not cpuinfo.is_file():
         return frozenset()
     for line in cpuinfo.read_text().splitlines():

@@ -9,13 +9,14 @@ from types import FrameType
 
 @contextmanager
 def interrupts(*numbers: int) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether one of the signals `numbers` has arrived; a loop calls
-    it.
+    """Yield a function that returns whether one of the signals `numbers` has arrived. A loop calls
+    the function between two iterations.
 
-    A KeyboardInterrupt raised inside a callback, a finaliser or an extension module can be lost:
-    numpy discards one that is raised while it compares a scalar with an IntEnum. A second signal
-    raises KeyboardInterrupt. Only the main thread can receive signals; in another thread the
-    function always returns False.
+    The first signal raises no KeyboardInterrupt, because an interrupt that is raised inside a
+    callback, a finaliser or an extension module can be lost: numpy discards a KeyboardInterrupt
+    that is raised while it compares a scalar with an IntEnum. The same signal raises
+    KeyboardInterrupt when it arrives a second time. Only the main thread can receive signals; in
+    another thread the function always returns False.
     """
     seen: list[int] = []
     if threading.current_thread() is not threading.main_thread():

@@ -17,7 +17,7 @@ from trackfeatures.errors import UserError
 LOOPBACKS = {socket.AF_INET: "127.0.0.1", socket.AF_INET6: "::1"}
 CONNECT_S = 0.25  # least time to connect to one address, unless less time remains in total
 PORT_TRIES = 8  # attempts to find one port that is free on every address of a host
-# Errors of a kernel or a host without IPv4 or without IPv6; the other family is used then.
+# Errors of a machine that lacks IPv4 or IPv6. The addresses of the other protocol are used then.
 NO_FAMILY = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUPPORT)
 SO_ATTACH_FILTER = 26  # Linux's value; Python's `socket` lacks it
 # Classic BPF on a TCP header: drop (return 0) packets with the SYN flag (0x02 of byte 13).
@@ -36,10 +36,12 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def bind_all(host: str, port: int) -> list[socket.socket]:
-    """Bind TCP sockets to the same port of all addresses of `host` ("localhost" has two).
+    """Bind TCP sockets to the same port of all addresses of `host`; "localhost" has the addresses
+    127.0.0.1 and ::1.
 
-    `::` also accepts IPv4. An address is left out if this machine lacks IPv4 or IPv6, unless no
-    address remains. Raises UserError if an address is in use, unknown or forbidden.
+    The address `::` also accepts IPv4 connections. An address is left out if this machine lacks
+    its protocol, IPv4 or IPv6. Raises UserError if no address remains, or if an address is in use,
+    unknown or forbidden.
     """
     for _ in range(PORT_TRIES):
         try:
@@ -75,7 +77,8 @@ def _bind_all(host: str, port: int) -> list[socket.socket]:
 
 
 def _at_port(address: Address, bound: list[socket.socket]) -> Address:
-    """`address` with the port of the first bound socket, if there is one."""
+    """Return `address` with the port of the first socket in `bound`, or unchanged if `bound` is
+    empty."""
     if not bound:
         return address
     *rest, place = address
@@ -99,9 +102,10 @@ def _bind(address: Address) -> socket.socket:
 
 
 def _addresses(host: str, port: int, flags: int = 0) -> list[Address]:
-    """The TCP addresses of a host, without duplicates.
+    """Return the TCP addresses of `host`, without duplicates.
 
-    "localhost" always has both loopback addresses (RFC 6761, 6.3); /etc/hosts can lack one.
+    For "localhost" the result always contains both loopback addresses (RFC 6761, 6.3), also if one
+    of them is missing in /etc/hosts.
     """
     hosts = [host]
     if is_localhost(host):
@@ -118,7 +122,8 @@ def _addresses(host: str, port: int, flags: int = 0) -> list[Address]:
 
 
 def is_localhost(host: str) -> bool:
-    """Whether a name stands for the loopback addresses: "localhost" or a name below it."""
+    """Whether the name `host` stands for the loopback addresses: "localhost" or a name that ends in
+    ".localhost"."""
     name = host.lower().removesuffix(".")
     return name == "localhost" or name.endswith(".localhost")
 
@@ -126,12 +131,14 @@ def is_localhost(host: str) -> bool:
 def connect(
     place: tuple[str, int], timeout_s: float | None, source: tuple[str, int] | None = None
 ) -> socket.socket:
-    """Connect to the first address of `place` (host, port) that accepts, in `timeout_s` in total,
-    from the local address `source` if it is given.
+    """Connect to the first address of `place` (host, port) that accepts the connection; all
+    attempts together take at most `timeout_s`. `source` is the local address (host, port), None
+    for any.
 
-    Each address gets an equal share of the remaining time, but at least 0.25 s (CONNECT_S) if so
-    much remains. Raises the OSError of the first address; the error of a missing IPv4 or IPv6 only
-    if there is no other. The arguments are those of `socket.create_connection`.
+    Each address gets an equal share of the remaining time, but at least 0.25 s (CONNECT_S), unless
+    less time remains. If all addresses fail, the first OSError is raised that does not report a
+    missing IPv4 or IPv6; if there is none, the first OSError is raised. The arguments are the
+    arguments of `socket.create_connection`.
     """
     host, port = place
     addresses = _addresses(host, port)
@@ -161,12 +168,12 @@ def connect(
 
 
 def refuse_connections(listener: socket.socket) -> None:
-    """Start no new connections on a listening socket; connections in its queue can be accepted.
+    """Refuse new connections to a listening socket; connections in its queue can still be accepted.
 
     Closing a listening socket resets the connections in its queue, and a connection could always
-    arrive between the last accept and the close. So from now on the kernel drops SYN packets: the
-    client sends its SYN again after 1 s, and is refused once the socket is closed. Does nothing on
-    systems without socket filters; Linux has them.
+    arrive between the last accept and the close. Therefore, after this call the kernel drops SYN
+    packets. A client sends its SYN packet again after 1 s, and is refused once the socket is
+    closed. This function does nothing on systems without socket filters; Linux has socket filters.
     """
     program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in NO_SYN))
     head = struct.pack("HP", len(NO_SYN), ctypes.addressof(program))
@@ -175,8 +182,8 @@ def refuse_connections(listener: socket.socket) -> None:
 
 
 def address(listener: socket.socket, host: str) -> str:
-    """Return the URL of the service on a bound socket, with the actual port (for port 0 the system
-    chose it)."""
+    """Return the URL of the service at `host` that listens on the bound socket `listener`. The URL
+    contains the actual port, which the system chose if port 0 was requested."""
     return url(host, listener.getsockname()[1])
 
 

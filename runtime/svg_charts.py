@@ -17,16 +17,16 @@ SIDE = 1000.0
 LOG_FLOOR = 1e-9
 """A logarithmic axis draws smaller values, including 0, at this value."""
 MAX_POINTS = 800
-"""Number of points of a line above which callers should thin out their data: screens are not
-wider."""
+"""Largest useful number of points of a line. Callers should thin out longer lines, because a screen
+does not show more points."""
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis from the value `first` to the value `last`, logarithmic with `log`. Calling it maps
-    values to SVG coordinates, 0 at `first` and 1000 (SIDE) at `last`."""
+    """An axis from the value `first` to the value `last`; it is logarithmic if `log` is true.
+    Calling the axis maps values to SVG coordinates, 0 at `first` and 1000 (SIDE) at `last`."""
 
     first: float
     last: float
@@ -72,8 +72,8 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return ticks between two positive numbers: 1, 2 and 5 times each power of ten; only the
-    powers of ten if more than four of them are in the range."""
+    """Return the ticks between two positive numbers. The ticks are 1, 2 and 5 times each power of
+    ten, or only the powers of ten if the range contains more than four of these."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     found = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 5)]
     inside = [value for value in found if low <= value <= high]
@@ -141,8 +141,8 @@ def line_plot(plot: Plot) -> Markup:
 
 
 def reliability_diagram(title: str, predicted: FloatArray, observed: FloatArray) -> Markup:
-    """Draw observed errors (N,) over predicted standard deviations (N,) as an HTML figure, on
-    logarithmic axes with the diagonal."""
+    """Draw the observed errors (N,) over the predicted standard deviations (N,), both in one unit,
+    as an HTML figure with logarithmic axes. The diagonal shows where both are equal."""
     both = np.maximum(np.concatenate([predicted, observed]), LOG_FLOOR)
     low, high = float(both.min()) * 0.8, float(both.max()) * 1.25
     x_axis, y_axis = Axis(low, high, log=True), Axis(high, low, log=True)
@@ -229,11 +229,11 @@ MARGIN, FOOT = 6, 18
 
 
 def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) -> Markup:
-    """Draw a histogram of the finite values (N,) of each split in 48 equal bins (BINS) as an HTML
-    figure.
+    """Draw a histogram with 48 equal bins (BINS) as an HTML figure. `values` has an array (N,) in
+    `unit` for the name of each split of a dataset.
 
-    NaN is an absent value; the figure states the share of values that are present. The bins of a
-    split sum to one, so that splits of different sizes can be compared.
+    NaN is an absent value; the figure states the share of values that are present. The heights of
+    the bins of a split sum to one, so that splits of different sizes can be compared.
     """
     finite = {split: column[np.isfinite(column)] for split, column in values.items()}
     filled = [column for column in finite.values() if column.size]
@@ -257,8 +257,9 @@ def histogram(title: str, unit: str, values: Mapping[str, NDArray[np.float32]]) 
 
 
 def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
-    """Draw a bar chart as an HTML figure: a row for each name in `counts`, with a bar for each of
-    its numbers of frames, which are those of the splits train, test and unseen in this order."""
+    """Draw a bar chart as an HTML figure, with a row for each name in `counts`. The numbers of a
+    row are the numbers of frames in the splits train, test and unseen, in this order. Each number
+    has a bar."""
     top = max((max(row) for row in counts.values()), default=0) or 1
     rows = []
     for name, row in counts.items():
@@ -275,7 +276,7 @@ def bars(title: str, counts: Mapping[str, Sequence[int]]) -> Markup:
 
 
 def _outline(share: FloatArray, colour: str) -> str:
-    """SVG polygon of a histogram with the bin heights `share` (BINS,) in [0, 1]."""
+    """Return the SVG polygon of a histogram with the bin heights `share` (BINS,) in [0, 1]."""
     x = _bin_x(np.repeat(np.linspace(0.0, 1.0, BINS + 1), 2))
     y = HEIGHT - FOOT - np.pad(np.repeat(share, 2), 1) * (HEIGHT - FOOT - 4)
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
@@ -283,8 +284,8 @@ def _outline(share: FloatArray, colour: str) -> str:
 
 
 def _value_axis(low: float, high: float) -> str:
-    """SVG of a histogram's axis from `low` to `high`: labels at both ends, and a line at zero if
-    zero is between them."""
+    """Return the SVG of a histogram's axis from `low` to `high`: labels at both ends, and a line at
+    zero if zero is between `low` and `high`."""
     drawn = _text(MARGIN, "start", f"{low:.3g}") + _text(WIDTH - MARGIN, "end", f"{high:.3g}")
     if low < 0.0 < high:
         zero = -low / (high - low)

@@ -11,8 +11,8 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 
 class TensorBoardWriter:
-    """Writes scalars to a new event file in `folder`. TensorBoard then ignores the points of other
-    files in it from `purge_step` on, for a training that continues from that step.
+    """Writes scalars to a new event file in `folder`. For a training that continues from the step
+    `purge_step`, TensorBoard ignores the points from this step on in older files of the folder.
 
     torch's SummaryWriter is not used: its thread prints a traceback if the disk is full.
     """

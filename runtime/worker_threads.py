@@ -4,8 +4,10 @@ import os
 
 
 def thread_limits(workers: int) -> dict[str, str]:
-    """Return the environment variables that give each of `workers` processes its share of the
-    cores; libraries read them when they are loaded."""
+    """Return environment variables that limit the threads in each of `workers` processes. Mesa's
+    software renderer gets the process's share of the cores, or draws in the calling thread if the
+    share is one core. OpenMP and OpenBLAS get one thread. The libraries read the variables when
+    they are loaded."""
     share = (os.cpu_count() or 1) // workers
     return {
         "LP_NUM_THREADS": str(share if share > 1 else 0),
