@@ -1,8 +1,9 @@
 """Trains a steering policy with the PPO of Stable-Baselines3, on many cars and random roads.
 
 Run: `pip install stable-baselines3`, then `python examples/train_ppo.py [STEPS] [CARS]`; the
-default is 1,000,000 steps of 64 cars. Prints the mean score of an episode's step at the start and
-at the end, and saves the policy as `ppo.zip` in the working folder.
+default is 1,000,000 control steps, summed over 64 cars. Prints the mean reward per control step
+over the first tenth and over the last tenth of the episodes, and saves the policy as `ppo.zip` in
+the working folder.
 """
 
 import sys
@@ -28,7 +29,8 @@ class Scores(BaseCallback):
 
 
 def train(steps: int, cars: int) -> tuple[float, float]:
-    """Mean score per step of the first and of the last tenth of the episodes."""
+    """Train a policy for `steps` control steps, summed over `cars` cars, and save it. Return the
+    mean reward per control step over the first tenth and over the last tenth of the episodes."""
     envs = StableBaselinesCars(
         cars,
         track="random",
