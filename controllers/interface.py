@@ -12,7 +12,8 @@ from trackfeatures import RoadClass
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One control step: the perceived road and the car's own sensors."""
+    """The input of a controller in one control step: the perceived road and the measurements of the
+    car's own sensors."""
 
     to_lane_centre: float
     """Offset (m, left positive) from the centre of the lane to follow; the paper's e1."""
@@ -27,13 +28,13 @@ class Observation:
     yaw_rate: float
     """Yaw rate, rad/s, counter-clockwise."""
     curvature: float | None = None
-    """Curvature (1/m, left positive) of the road just ahead; None on perception, which does not
-    measure it."""
+    """Curvature (1/m, left positive) of the road just ahead; None if a model perceives the road,
+    because a model does not predict the curvature."""
 
 
 _values = attrgetter(*(field.name for field in fields(Observation)))
 TO_LANE_CENTRE, ANGLE, HEADING, VX, VY, YAW_RATE, CURVATURE = range(7)
-"""Columns of `Observations.rows`, for compiled code."""
+"""Indices of the columns of `Observations.rows`, for compiled code."""
 OBSERVED = len(fields(Observation))
 
 
@@ -52,7 +53,7 @@ class Observations:
     """One control step of N cars: each field of `Observation` is an array (N,)."""
 
     rows: NDArray[np.float64]
-    """(N, OBSERVED): the fields of `Observation` in their order; NaN stands for None."""
+    """(N, 7): the fields of `Observation` in their order; NaN stands for None."""
 
     to_lane_centre = _Column(TO_LANE_CENTRE)
     angle = _Column(ANGLE)
@@ -107,7 +108,8 @@ class BatchController(Controller, Protocol):
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """The properties of a control loop that a controller is made for."""
+    """The properties of the control loop in which a controller will run; a controller is made for
+    them."""
 
     dt: float
     """Duration of a control step, s."""

@@ -219,7 +219,7 @@ def _load_file(path: Path) -> ModuleType:
     sys.modules[spec.name] = module  # dataclasses look up postponed annotations there
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # as above
+    except Exception as error:  # a user's file may raise anything
         raise UserError(f"{path} cannot be loaded: {_line(error)}") from error
     return module
 

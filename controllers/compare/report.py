@@ -19,7 +19,8 @@ PAPER_SCORES = {
     "eroad": (3591.9, 3603.6, 3593.9),
     "g-track-3": (3209.4, 3210.5, 3215.3),
 }
-"""The best scores of the paper's LQR, MPC and RL, over the numbers of steps in `SCORED_STEPS`."""
+"""The best scores that the paper reports for its LQR, MPC and RL on each track, over the numbers of
+steps in `SCORED_STEPS`."""
 FIGURES = (
     "track", "controller", "score", "score per step", "quadratic per step", "mean |d| (m)",
     "max |d| (m)", "in the lane", "laps", "speed (km/h)", "blind steps", "ended",
@@ -65,8 +66,8 @@ def score_table(drives: list[dict[str, Any]]) -> tuple[list[str], list[list[str]
 def figure_rows(drives: list[dict[str, Any]]) -> Iterator[list[str]]:
     """Yield a table row for each track and controller in `drives`, entries of `results.json`.
 
-    The titles of the columns are FIGURES. Each cell combines the drives of all seeds: it has a
-    mean, an extreme value, or a range.
+    The titles of the columns are in FIGURES. Each cell combines the drives of all seeds: it
+    contains their mean, an extreme value, or a range.
     """
     pairs = dict.fromkeys((entry["track"], entry["controller"]) for entry in drives)
     for track, controller in pairs:

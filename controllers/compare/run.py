@@ -1,9 +1,9 @@
 """The drives of a comparison, and the file with their results.
 
-Drives with exact states (perception `truth`) are made at once if their controller has
+Drives with exact states (perception `truth`) are made in batches if their controller has
 `update_batch`; all other drives are made one by one. `results.json` is {"version", "settings",
-"drives": [...]} and is written after each batch. A drive whose result is in the file is made again
-only if its controller, tuned parameters, road or model has changed.
+"drives": [...]} and is written after each batch or single drive. A drive whose result is in the
+file is made again only if its controller, tuned parameters, road or model has changed.
 """
 
 import hashlib
@@ -35,13 +35,14 @@ VERSION = 3
 """Version of `results.json`."""
 RESULTS, REPORT = "results.json", "report.html"
 SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "views", "light")
-"""Settings that are equal for all drives of a file."""
+"""Names of the options of a comparison that are equal for all drives in a `results.json`."""
 
 Progress = Callable[[float, int, str], None]
 """A function that is called, by several threads, with the number of drives done (parts count as
 fractions), the total number of drives, and the name of the present drive or controller."""
 Report = Callable[[float, str], None]
-"""A function that is called with the number of drives done and the name of the present drive."""
+"""A function that is called with the number of drives done (parts count as fractions) and the name
+of the present drive or controller."""
 Driven = dict[str, Any] | UserError
 """The result of a drive with its curves, or the error of a drive without a result."""
 
@@ -63,7 +64,8 @@ class Cell:
 
 
 def cells(config: CompareConfig) -> list[Cell]:
-    """Return all drives, ordered by track. Raises UserError if an option has no name or seed."""
+    """Return the cells of all drives, ordered by track. Raises UserError if there is no seed, or no
+    name in an option that lists tracks, perceptions or controllers."""
     if config.seeds < 1:
         raise UserError(f"{config.seeds} seeds; give 1 or more")
     disturbances = list(DISTURBANCES) if config.disturb else [UNDISTURBED]
@@ -90,9 +92,9 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
     """Make the drives whose results are missing in `config.out`; return the content of
     `results.json`, with only the drives of this comparison.
 
-    Raises UserError before the first drive for an unknown name, results of other settings, or a
-    folder to which another process writes. Raises ContactsUnavailable after the last drive if a car
-    touched something; the results of the other drives are in `results.json`.
+    Raises UserError before the first drive for an unknown name, a `results.json` with other
+    settings, or a folder to which another process writes. Raises ContactsUnavailable after the last
+    drive if a car touched something; the results of all other drives are then in `results.json`.
     """
     todo = cells(config)
     for controller in dict.fromkeys(cell.controller for cell in todo):
@@ -110,7 +112,8 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
 def _drive_missing(
     config: CompareConfig, todo: list[Cell], progress: Progress | None
 ) -> dict[str, Any]:
-    """Drive the cells of `todo` without a result in the folder; write the results of each batch."""
+    """Make the drives of `todo` whose results are missing in the folder `config.out`; write and
+    return the content of `results.json`."""
     path = config.out / RESULTS
     content = read_results(path, config)
     known = {_key(entry): entry for entry in content["drives"]}
@@ -144,8 +147,8 @@ def _drive_missing(
 def drive_cells(
     config: CompareConfig, missing: list[Cell], report: Report
 ) -> Iterator[list[tuple[Cell, Driven]]]:
-    """Make the `missing` drives; yield batches of them with their results. `report` is called with
-    the number of drives done (parts count as fractions) and the name of the drive or controller."""
+    """Make the drives of the cells `missing`; yield batches of cells with their results. `report`
+    is called as described at `Report`."""
     tasks = tasks_of(config, missing)
     groups = groups_at_once(config, tasks)
     done = 0
@@ -199,7 +202,7 @@ def tasks_of(config: CompareConfig, todo: list[Cell]) -> dict[Cell, Task]:
 
 
 def groups_at_once(config: CompareConfig, tasks: dict[Cell, Task]) -> dict[str, list[Cell]]:
-    """Return by controller the drives of `tasks` that `drive_many` can make at once."""
+    """Return the drives of `tasks` that `drive_many` can make in batches, by controller."""
     groups: dict[str, list[Cell]] = {}
     for cell, (drive_config, _) in tasks.items():
         if can_join(drive_config):
@@ -270,14 +273,15 @@ def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
 
 
 def _model_of(config: CompareConfig, perception: str) -> str:
-    """The hash of the weights of a perception's model; empty for the truth."""
+    """Return the hash of the weights of the perception's model; "" for `truth` (no model)."""
     if perception == "truth":
         return ""
     return model_hash(config.model) if perception == "model" else service_model_hash(perception)
 
 
 def _files_of(controller: str) -> list[Path]:
-    """Paths of a controller's module, or of the file with a user's class, and of its weights."""
+    """Return the paths of a controller's files: the module of a controller of this project and its
+    weights, if it has any; the weights of a trained actor; or the file of a user's class."""
     if controller in CONTROLLERS:
         module = CONTROLLERS[controller].factory.partition(":")[0]
         weights = SHIPPED / controller / WEIGHTS
@@ -289,7 +293,7 @@ def _files_of(controller: str) -> list[Path]:
 
 
 def model_hash(run: str) -> str:
-    """Return the SHA-256 of the weights of a run, given by its folder or name."""
+    """Return the SHA-256 of the weights of the run `run`, which is a folder or a name."""
     from mtlnet.inference.model_card import read_card, resolve_run
 
     return read_card(resolve_run(run)).model_hash

@@ -30,19 +30,21 @@ VERSION = 1
 EXPLORED = 1.0 / 3.0
 """Share of the candidates that are random over the whole ranges."""
 SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed", "budget")
-"""Settings that are stored in the file. A search with other settings refuses the file."""
+"""Settings that are stored in the file of a search. A search with other settings refuses this
+file."""
 
 Progress = Callable[[int, int, str], None]
-"""A function that is called with the candidates done, their total number, and the controller."""
+"""A function that is called with the number of candidates done, the total number of candidates, and
+the name of the controller."""
 
 
 def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]:
     """Search for the best parameters of each controller; return the content of the file
     `config.out`.
 
-    The content is {"version", "settings", "controllers"}; it has the parameters and the reward per
-    step of each controller's best candidate, and all candidates tried. Raises UserError for an
-    unknown name, or a file of other settings.
+    The content is {"version", "settings", "controllers"}. For each controller it has the parameters
+    and the reward per step of the best candidate, and all candidates that were tried. Raises
+    UserError for an unknown name, or for a file of a search with other settings.
     """
     controllers = names(config.controllers, "controllers")
     for controller in controllers:

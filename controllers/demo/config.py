@@ -12,7 +12,8 @@ from trackfeatures.errors import UserError
 
 @dataclass(frozen=True, slots=True)
 class DemoConfig:
-    """What the demo collects and how long it trains; the defaults take 17 minutes on two cores."""
+    """The numbers of rounds and frames that the demo collects, and the time that it trains. With
+    the defaults the demo takes 17 minutes on two cores."""
 
     out: Annotated[Path, "Folder to write all results to."] = Path("demo")
     rounds: Annotated[
@@ -37,9 +38,10 @@ class DemoConfig:
 
     tracks: str = "circuit,forest,highway,mountain-pass,ring-road"
     alpha: str = "0.3,0.2,0.5"
-    """Task weights of the loss."""
+    """Weights of the network's three tasks in the loss, as in the option `--alpha` of `mtlnet
+    train`."""
     asked: int = 12
-    """Held-out frames that are posted to the service."""
+    """Number of held-out frames that are posted to the service."""
     drive_track: str = "highway"
 
     def __post_init__(self) -> None:

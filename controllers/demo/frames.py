@@ -1,4 +1,4 @@
-"""Held-out frames for the demo: their choice from the test rounds, and the service's answers."""
+"""Chooses held-out frames from the demo's test rounds, and gets the service's answers to them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from trackfeatures import MARKINGS, RoadClass, localise
 
 @dataclass(frozen=True, slots=True)
 class PostedFrame:
-    """One held-out frame (JPEG), its labels, and the answer of the service.
+    """One held-out frame (JPEG), its labels, and the answer of the service to this frame.
 
     The distances and the offset are in m, the angle in rad, the curvature in 1/m.
     """
@@ -50,7 +50,8 @@ def spread(frames: Frames, count: int, rng: np.random.Generator) -> list[int]:
 
 
 def post_frames(frames: Frames, indices: list[int], client: Client) -> list[PostedFrame]:
-    """Post the recorded JPEG files to the service; returns the answers with the labels."""
+    """Post the recorded JPEG images of the frames with the given `indices` to the service. Returns
+    the answers together with the labels of the frames."""
     return [_post_frame(frames, index, client) for index in indices]
 
 

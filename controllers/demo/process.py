@@ -15,7 +15,8 @@ from serve.client import Client
 from trackfeatures import UserError
 
 START_LIMIT_S, STOP_LIMIT_S = 60.0, 10.0
-"""Time (s) in which the service must be ready, and time in which a child process must end."""
+"""Time (s) after its start in which the service must be ready, and time (s) after Ctrl-C or SIGTERM
+in which a child process must end."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -91,7 +92,8 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
 
 
 def _wait(child: "subprocess.Popen[bytes] | subprocess.Popen[str]") -> bool:
-    """Wait until the process ends, at most `STOP_LIMIT_S`; False if it had to be killed."""
+    """Wait until the process ends, and kill it after `STOP_LIMIT_S` (s). Returns False if it had to
+    be killed."""
     try:
         child.wait(STOP_LIMIT_S)
     except subprocess.TimeoutExpired:

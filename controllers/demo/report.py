@@ -1,4 +1,5 @@
-"""The demo's results: limit checks, tables for the terminal, and an HTML report in one file."""
+"""Compares the demo's results with their limits, and writes them as tables for the terminal and as
+an HTML report in one file."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,7 +28,8 @@ LIMITS = {"ml": 0.35, "mr": 0.35, "angle": 0.03, "heading": 0.85}
 """Largest allowed mean errors of `ml` and `mr` (m) and of the angle (rad), and least allowed share
 of right classes of the road."""
 MAX_MEAN_ABS_D_M = 0.3
-"""Largest mean offset (m) of the drive on the service's answers; the car must stay on the road."""
+"""Largest allowed mean distance (m) from the centre of the lane in the drive on the service's
+answers."""
 LIMIT_COLUMNS = ("feature", "mean error", "limit", "training mean", "ratio", "reached")
 LEARNED_RATIO = 0.65
 """A feature counts as learned if its error is at most this share of the baseline's error. The
@@ -45,7 +47,7 @@ CURVE_COLOURS = {"distance": "#22bb66", "angle": "#ee8822", "type": "#3366cc"}
 
 @dataclass(frozen=True, slots=True)
 class LimitCheck:
-    """A result of the demo, with its limit and the result of a baseline.
+    """The comparison of one result of the demo with its limit and with the result of a baseline.
 
     The baseline always predicts the mean of the training labels, or the most frequent class.
     """
@@ -53,12 +55,14 @@ class LimitCheck:
     what: str
     """Name of the result, with its unit."""
     figure: float
+    """The result: an error or a share."""
     mean: float | None
     """The result of the baseline; None without a baseline."""
     limit: float | None = None
     """None if the demo sets no limit."""
     reached: bool = True
-    """Whether the result is within its limit."""
+    """Whether the result meets its requirements: the limit; for the error of a feature with a limit
+    also LEARNED_RATIO; for the drive also that it did not end early."""
 
     @property
     def word(self) -> str:
@@ -68,7 +72,8 @@ class LimitCheck:
 
 
 def check_limits(result: DemoResult) -> list[LimitCheck]:
-    """Return the checks of all results of the demo: evaluation, posted frames, drive."""
+    """Compare all results of the demo with their limits: the results of the evaluation, of the
+    posted frames and of the drive."""
     return [
         *check_evaluation(result.evaluation),
         *check_posted(result.asked, result.evaluation),
@@ -107,8 +112,9 @@ def check_posted(frames: list[PostedFrame], evaluation: dict[str, Any]) -> list[
     """Compare the service's mean errors of angle and offset over the posted `frames` with their
     limits.
 
-    The limits are the 95th percentiles of the errors in `evaluation`. A service with another camera
-    or another model exceeds them by far.
+    The limits are the 95th percentiles of the errors in `evaluation`, the output of `mtlnet
+    evaluate --json`. If the service used another camera or model than the evaluation, its errors
+    would exceed the limits by far.
     """
     found = []
     for what, name, pairs in (
@@ -139,8 +145,9 @@ def check_drive(drive: dict[str, Any]) -> LimitCheck:
 
 
 def check_cells(check: LimitCheck) -> tuple[str, ...]:
-    """Return the cells of a check's table row: name, mean error, limit, error of the baseline,
-    ratio of the two errors, and "yes" or "NO"."""
+    """Return the cells of the table row of `check`: the name, the result (usually a mean error),
+    its limit, the result of the baseline, the ratio of the two results, and "yes" or "NO" for
+    `check.reached`. A cell without a value is empty."""
     limit = "" if check.limit is None else f"{check.limit:.4g}"
     mean = "" if check.mean is None else f"{check.mean:.4f}"
     ratio = "" if check.mean is None else f"{check.figure / check.mean:.2f}"
@@ -173,7 +180,8 @@ def write_report(config: DemoConfig, result: DemoResult) -> Path:
 
 
 def _answer_cells(frame: PostedFrame) -> tuple[str, ...]:
-    """Return a frame's row, "true / predicted" values; the columns are `ANSWER_COLUMNS`."""
+    """Return the cells of the table row of `frame`, "true / predicted" values. The columns are
+    `ANSWER_COLUMNS`."""
     answer = frame.answer
     distances = ((frame.distances[name], answer["distances_m"][name]) for name in MARKINGS)
     return (
@@ -192,7 +200,8 @@ def _pair(true: float | None, predicted: float | None, digits: int) -> str:
 
 
 def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[dict[str, str]]:
-    """Yield each frame, with true and predicted markings drawn on it, and its caption."""
+    """Yield the image of each frame, on which the true and the predicted markings are drawn, and
+    its caption. `camera` is the camera of the frames."""
     for one in frames:
         image = simplejpeg.decode_jpeg(one.jpeg)
         prediction = (one.answer["distances_m"], one.answer["angle_rad"])
@@ -203,8 +212,8 @@ def _figures(camera: CameraParameters, frames: list[PostedFrame]) -> Iterator[di
 
 
 def _training_curves(path: Path) -> Markup | None:
-    """A chart of the losses over the training steps, as shares of their first values; None if the
-    file `path` has no row."""
+    """Return a chart of the losses over the training steps, read from the CSV file `path`. Each
+    loss is divided by its first value. Returns None if the file has no row."""
     rows = read_curves(path)
     if not rows:
         return None
@@ -221,7 +230,8 @@ def _training_curves(path: Path) -> Markup | None:
 
 
 def print_tables(checks: list[LimitCheck], frames: list[PostedFrame]) -> None:
-    """Print the limit checks and the true and predicted values on stdout."""
+    """Print two tables on stdout: the comparison of the results with their limits, and the true and
+    predicted values of `frames`."""
     console = Console()
     console = Console(width=max(console.width, MIN_TERMINAL_WIDTH))
     console.print(_limit_table(checks))

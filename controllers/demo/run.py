@@ -1,4 +1,5 @@
-"""The steps of the demo. Each step is a command of this project and is printed before it runs."""
+"""Runs the steps of the demo. Each step is a command of this project; the command is printed before
+it runs."""
 
 import json
 import shlex
@@ -24,13 +25,15 @@ LOG = Console(stderr=True, highlight=False, markup=False)
 FIRST_TRACK = "coast"
 """Track of the first drive; no model is trained on it."""
 FIRST_FRAMES, FIRST_POSTED = 60, 4
-"""Frames of the first drive, and how many of them are posted to the service."""
+"""Number of frames of the first drive, and number of these frames that are posted to the
+service."""
 TEST_SHARE = 0.1
 """Share of the collected rounds that is held out for testing."""
 DRIVE_STEPS = 800
 """Control steps of 50 ms of the drive: 40 s from a standing start."""
 COLLECTED_PER_S, CHECKED_PER_S = 250, 2_000
-"""Frames that two cores collect and verify in a second, for the plan that `announce` prints."""
+"""Frames that two cores collect in a second, and frames that they verify in a second. The plan that
+`announce` prints is computed from these speeds."""
 
 
 @dataclass(slots=True)
@@ -44,7 +47,7 @@ class DemoResult:
     commands: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     shipped: list[PostedFrame] = field(default_factory=list)
-    """Frames with the answers of the shipped model."""
+    """Frames of the first drive with the answers of the shipped model."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields as values for JSON, without the images."""
@@ -55,7 +58,7 @@ class DemoResult:
 
 
 def announce(config: DemoConfig) -> None:
-    """Print the parts of the demo, and about how long each takes on two cores."""
+    """Print the parts of the demo, and the approximate duration of each part on two cores."""
     frames = config.rounds * config.frames
     parts = [
         (0.5, f"first drive: a film of the shipped model's answers, {config.out / 'first.mp4'}"),
@@ -81,16 +84,16 @@ def run_demo(config: DemoConfig) -> DemoResult:
     """Try the shipped model, then collect, verify, train, evaluate, serve, predict and drive.
 
     All results are written to `config.out`. With `config.first_drive` the demo ends after the drive
-    of the shipped model. Raises UserError if `config.out` contains files that are not of a demo, or
-    if a step fails.
+    of the shipped model. Raises UserError if `config.out` contains files that no demo has written,
+    or if a step fails.
     """
     _check_folder(config.out)
     result = DemoResult()
     data, run = str(config.out / "data"), str(config.out / "run")
     collect = ["datagen", "collect", "--out", data, "--json"]
     collect += ["--rounds", str(config.rounds), "--frames", str(config.frames)]
-    # A short training needs frames that are far apart, each with another scenery
-    # (docs/experiments/data.md). The default for rounds of this length is one scenery per round.
+    # A short training needs frames that are far apart in time and whose sceneries differ from frame
+    # to frame (docs/experiments/data.md). By default a round of this length has one scenery.
     collect += ["--frequency", "4", "--stretch", "1", "--scenes", "4"]
     collect += ["--split-test-share", f"{TEST_SHARE:g}"]
     collect += ["--tracks", config.tracks, "--seed", str(config.seed)]
@@ -152,8 +155,8 @@ def _use_service(config: DemoConfig, result: DemoResult) -> None:
 def write_soft_parameters(path: Path) -> Path:
     """Write a parameter file for `controllers drive --parameters` to `path`; return `path`.
 
-    The weights of `lqr-preview` in the file give low gains, for the errors of a model that was
-    trained for minutes.
+    The file contains weights of the controller `lqr-preview` that lead to low gains, because the
+    answers of a model that was trained for minutes have large errors.
     """
     parameters = asdict(WEIGHTS_BRIEFLY_TRAINED)
     write_json(path, {"controllers": {"lqr-preview": {"parameters": parameters}}})

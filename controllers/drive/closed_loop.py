@@ -29,12 +29,12 @@ from trackfeatures.errors import UserError
 
 GEAR = 1
 HOLD_S = 0.5
-"""Time (s) for which the last offset is used after it is lost; from then on the offset is taken as
-0, so that the car drives along the road."""
+"""Time (s) for which the last perceived offset is used if the perception returns no offset.
+Afterwards the offset is taken as 0, so that the car drives along the road."""
 RUN_UP_S = 15.0
-"""Duration (s) of the standing start, which `cruising_kmh` leaves out."""
+"""Duration (s) of the standing start, which `DriveResult.cruising_kmh` leaves out."""
 EASE_OFF = 1.0  # m/s2 of demanded braking at which the throttle is closed
-FULL_BRAKING = 15.0  # m/s2 at full brake on asphalt
+FULL_BRAKING = 15.0  # deceleration (m/s2) at full brake on asphalt
 LOST_SPEED, LOST_BRAKE = 5.0, 0.1
 """When the perception is lost, the car slows down to LOST_SPEED (m/s) with the brake LOST_BRAKE (0
 to 1)."""
@@ -93,14 +93,15 @@ class DriveResult:
     steps_asked: int
     """Control steps requested."""
     score: float
-    """Sum of the reward over `steps_asked`; a step that ends the drive counts -2, later steps 0."""
+    """Sum of the rewards over `steps_asked` steps. If the drive ended early, its last step counts
+    -2 and the steps that were not driven count 0."""
     score_per_step: float
     """`score` divided by `steps_asked`."""
     quadratic_per_step: float
-    """Mean of the paper's quadratic reward over `steps_asked`; the step that ends the drive and all
-    later steps count -2."""
+    """Mean of the paper's quadratic reward over `steps_asked` steps. If the drive ended early, its
+    last step and the steps that were not driven count -2 each."""
     laps: int
-    """Complete laps, from one crossing of the line to the next."""
+    """Number of complete laps, from one crossing of the start line to the next."""
     distance_m: float
     """Distance driven."""
     mean_abs_d_m: float
@@ -123,10 +124,11 @@ class DriveResult:
     """Why the drive ended early: off_track (also by a contact with a wall), backwards, or collision
     (with a car); None for a complete drive."""
     real_time: RealTimeFigures | None = None
-    """Figures of a drive on the wall clock; in JSON they are fields of the result itself."""
+    """Times of the answers and steps of a drive with `--realtime`, None for all other drives. In
+    JSON they are fields of the result itself."""
     speed_error_m_s: float | None = None
-    """Mean absolute difference from the set-point of `--speed` on free straights; None (absent from
-    JSON) without a set-point."""
+    """Mean absolute difference of the speed from the value of `--speed` on free straights; None
+    (absent from JSON) in a drive without `--speed`."""
 
     def per_step(self, reward: str) -> float:
         """Return the mean of the reward called `reward`, paper or quadratic, over the requested
@@ -217,7 +219,7 @@ def slow_down(speed: float, throttle: float, brake: float) -> tuple[float, float
 
 
 class OffsetMemory:
-    """Bridges steps without a perceived offset by the last offset, for at most `hold_steps`
+    """Replaces a missing offset by the last perceived offset, for at most `hold_steps` control
     steps."""
 
     def __init__(self, hold_steps: int) -> None:
@@ -258,7 +260,8 @@ class Driven:
     """The control steps that were driven, and how the drive ended."""
 
     after: FloatArray
-    """(n, 5): to_middle, angle, vx and vy after each step, and its steering action."""
+    """(n, 5): to_middle (m), angle (rad), vx and vy (m/s) after each of the n steps, and the
+    steering action of the step."""
     ended: Ending | None
     laps_begun: int
     distance_m: float
@@ -332,7 +335,8 @@ class DriveLog:
         file.write(",".join(COLUMNS) + "\n")
 
     def write(self, state: CarState, steer: float) -> None:
-        # th is counter-clockwise in the reference laps, `angle` is clockwise.
+        # th is positive counter-clockwise, as in the recorded TORCS laps; `angle` is positive
+        # clockwise.
         self._file.write(
             f"{state.time_s:.3f},{state.s:.3f},{state.to_middle:.5f},{-state.angle:.6f},"
             f"{state.speed:.4f},{state.vx:.4f},{state.vy:.4f},{state.yaw_rate:.6f},{steer:.6f},"

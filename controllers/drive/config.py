@@ -14,7 +14,8 @@ THROTTLE = 0.2
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """One closed-loop drive. Equal configurations give equal drives, except with `realtime`."""
+    """One closed-loop drive. Two drives with equal configurations are equal, unless `realtime` is
+    set."""
 
     controller: options.ControllerName = "lqr-preview"
     track: options.Track = "oval"

@@ -20,23 +20,25 @@ from trackfeatures.errors import UserError
 
 OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.05, 0.005
 SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S = 0.1, 0.01
-"""Standard deviations of the noise on an observation; each step has new random noise."""
+"""Standard deviations of the noise on the offset, the angle, the speeds vx and vy, and the yaw rate
+of an observation. Each control step has new random noise."""
 NOISE_STD = np.array(
     (OFFSET_NOISE_M, ANGLE_NOISE_RAD, SPEED_NOISE_M_S, SPEED_NOISE_M_S, YAW_RATE_NOISE_RAD_S)
 )
-"""The same standard deviations as an array, for offset, angle, vx, vy and yaw rate."""
+"""Standard deviations of the noise on offset (m), angle (rad), vx and vy (m/s), and yaw rate
+(rad/s), as an array."""
 DELAY_S = 0.1
 """Delay (s) of the perception."""
 GUST_M_S, GUST_S = 6.0, 1.5
 """Standard deviation (m/s) and correlation time (s) of the side wind, a Gauss-Markov process."""
 SIDE_FORCE_M2 = 4.5
-"""Slope of the side force coefficient (2.3 / rad) times the frontal area (m2). Half of it times air
-density, wind speed and driving speed is the side force."""
+"""Slope of the side force coefficient (2.3 / rad) times the frontal area (m2). The side force (N)
+is half of this product times air density (kg/m3), wind speed and driving speed (m/s)."""
 AIR_DENSITY = CarParameters.air_density
 FRICTION = (0.8, 1.6)
 """Range of the tyres' friction coefficient of a disturbed car."""
 SPREAD = 0.2
-"""Largest relative deviation of a disturbed car's mass and tyre stiffness."""
+"""Largest relative deviation of a disturbed car's mass and tyre stiffness from their defaults."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class Disturbance:
     stiffness: bool = False
 
     def car(self, seed: int) -> CarParameters:
-        """Return the car's parameters; the disturbed ones are random and depend on `seed` only."""
+        """Return the car's parameters. The disturbed parameters are random and depend only on
+        `seed`."""
         rng, car = np.random.default_rng([seed, 5]), CarParameters()
         low, high = FRICTION
         friction = rng.uniform(low, high)
@@ -174,7 +177,8 @@ def push(
     motion: FloatArray, yaw: float, vx: float, wind: float, mass: float, frequency_hz: int
 ) -> None:
     """Add the effect of a side `wind` (m/s, positive from the right) over a control step of 1 /
-    `frequency_hz` s to the velocity in `motion` (13,), world frame.
+    `frequency_hz` s to the car's velocity. The velocity is part of the car's motion state `motion`
+    (13,) in the world frame, which is changed in place.
 
     The car has the mass `mass` (kg), the yaw `yaw` (rad) and the forward speed `vx` (m/s).
     """

@@ -1,7 +1,7 @@
 """The film of a drive: the driver's view with true and perceived markings, and driving curves.
 
-The driver's view is on the left, the same markings from above on the right. The curves below show
-the offset and the angle of the last seconds. The truth is green, the perception orange.
+The driver's view is on the left, a top view of the same markings on the right. The curves below
+show the offset and the angle in the last 15 s. True values are green, perceived values orange.
 """
 
 from collections import deque
@@ -25,7 +25,8 @@ Image = NDArray[np.uint8]
 CURVE_S = 15.0  # s of driving that the curves show
 CURVE_HEIGHT = 90  # px
 OFFSET_SPAN_M, ANGLE_SPAN_RAD = 1.0, 0.1
-"""Values at the upper and lower edge of the curves; larger values are drawn at the edge."""
+"""Absolute values at the upper and lower edges of the curves' images. Larger values are drawn at
+the edge."""
 NOTHING: tuple[Distances, float] = ({}, 0.0)
 """The perceived markings and angle of a drive without a model: no markings, so that the film shows
 only the true ones."""
@@ -35,8 +36,8 @@ TEXT_COLOUR, GRID_COLOUR, BACK = (235, 235, 235), (90, 90, 96), 24
 class DriveFilm:
     """Draws a picture for each control step and writes it to the video file `film`.
 
-    With a camera perception the picture shows this perception's image and answer. If `perception`
-    is None, `camera` renders the image, and only the true markings are drawn.
+    If the drive has a camera perception, `perception`, the picture shows its image and its answer.
+    If `perception` is None, `camera` renders the image, and only the true markings are drawn.
     """
 
     def __init__(
@@ -101,8 +102,9 @@ def curves(values: NDArray[np.float64], length: int, width: int, span: float, ti
     """Draw a curve of the true and one of the perceived `values` (n, 2); return an RGB image (90,
     width, 3).
 
-    The image has room for `length` steps, and the last step is at its right edge. `span` is the
-    value at the upper edge, in the unit of `values`; up is positive (left). NaN leaves a gap.
+    The image has room for `length` control steps, and the last step is at its right edge. `span` is
+    the value at the upper edge, in the unit of `values`; up is positive (left). NaN leaves a gap.
+    `title` is written into the image.
     """
     strip = np.full((CURVE_HEIGHT, width, 3), BACK, np.uint8)
     middle = CURVE_HEIGHT // 2
@@ -110,7 +112,7 @@ def curves(values: NDArray[np.float64], length: int, width: int, span: float, ti
     place = (10, CURVE_HEIGHT - 8)
     cv2.putText(strip, title, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, GRID_COLOUR, 1, cv2.LINE_AA)
     x = width - 1 - (len(values) - 1 - np.arange(len(values))) * width / length
-    # The truth is drawn last, so that it covers an equal perceived value.
+    # The true curve is drawn last, so that it covers the perceived curve where both are equal.
     for column, colour in ((1, PREDICTION_COLOUR), (0, TRUTH_COLOUR)):
         shown = np.isfinite(values[:, column])
         y = middle - np.clip(values[:, column] / span, -1.0, 1.0) * (middle - 4)

@@ -1,4 +1,4 @@
-"""Drives many cars with one controller at the same time. Compiled calls move and observe the cars.
+"""Drives many cars with one controller at the same time; compiled code moves and observes the cars.
 
 The result of a drive equals the result of `controllers.drive.run.drive` bit for bit, for any number
 of drives. All drives have exact states and a constant throttle; each core moves a part of the cars.
@@ -48,8 +48,8 @@ FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
     *("target_lane", "seed", "model", "light"),
 )
-"""Options that can differ from their defaults. The model and the light do not change exact
-states."""
+"""Options of a drive with exact states that may differ from their defaults. The model and the light
+are allowed, because they have no effect on exact states."""
 STEPS_BETWEEN_REPORTS = 50
 LOOP = LoopConfig(1.0 / FREQUENCY_HZ)
 PHYSICS_STEPS = PHYSICS_HZ // FREQUENCY_HZ
@@ -88,7 +88,8 @@ class _Ride:
 def can_join(config: DriveConfig) -> bool:
     """Whether `drive_many` can make a drive if its controller has `update_batch`.
 
-    The drive must have exact states, without traffic, simulated latency, film, log or set speed.
+    All options of `config` except the options in FREE must have their default values. So the drive
+    has exact states and no traffic, simulated latency, film, log or set speed.
     """
     return config == replace(DriveConfig(), **{name: getattr(config, name) for name in FREE})
 
@@ -102,7 +103,7 @@ def drive_many(
 
     `parameters`, if given, are used instead of the parameters in the file that a configuration
     names. `report` is called with the number of drives done. Raises UserError for an unknown name,
-    a start outside the road, and an error of `update_batch`.
+    for a start outside the road, and if `update_batch` of the controller raises an error.
     """
     rides = _check(tasks)
     config = tasks[0][0]
@@ -170,12 +171,13 @@ class _Batch:
         self._arrays = _arrays(rides, [car.total_mass for car in cars])
 
     def drive(self) -> Iterator[float]:
-        """Drive all cars to the end; yields from time to time the share of the work done."""
+        """Drive all cars to the ends of their drives. Yields the share of the work done, 0 to 1,
+        from time to time."""
         for ride, world in zip(self._rides, self._worlds, strict=True):
             world.reset(seed=ride.seed, to_middle=ride.lane.start_d)
         rows, count = self._fleet.cars, len(self._rides)
         rows[:, COMMAND_AT + 1 : COMMAND_AT + 4] = THROTTLE, 0.0, GEAR
-        rows[:, DONE] = PHYSICS_STEPS  # the start is observed like a complete control step
+        rows[:, DONE] = PHYSICS_STEPS  # so that `observe_rides` observes the start, too
         observe_rides(0, count, self._fleet.arrays, self._arrays, PHYSICS_STEPS)
         observations, longest = Observations(self._arrays.seen), max(self._arrays.steps.tolist())
         for step in range(longest):
@@ -211,8 +213,8 @@ class _Batch:
         return steers
 
     def _complete(self) -> int:
-        """Complete the control steps of the cars that touch something; returns the number of these
-        cars whose drives go on."""
+        """Complete the control steps of the cars that touch something, because the compiled step
+        stops at a contact. Returns the number of these cars whose drives go on."""
         rows, fleet = self._fleet.cars, self._fleet.arrays
         waiting, running = (rows[:, SKIPPED] == 0.0) & (rows[:, DONE] < PHYSICS_STEPS), 0
         for number in np.flatnonzero(waiting).tolist():

@@ -69,17 +69,19 @@ class RideArrays(NamedTuple):
     noisy: NDArray[np.bool_]
     """(N,): whether `errors` are added to the observations."""
     errors: FloatArray
-    """(N, S, 5): errors of offset, angle, vx, vy and yaw rate."""
+    """(N, S, 5): errors of offset (m), angle (rad), vx and vy (m/s) and yaw rate (rad/s) in each
+    control step."""
     gusts: FloatArray
-    """(N, S): side wind, m/s."""
+    """(N, S): side wind in each control step, m/s, positive from the right."""
     masses: FloatArray
     """(N,): mass of each car, kg."""
 
 
 @compiled_for_threads
 def command_rides(fleet: Arrays, rides: RideArrays, steers: FloatArray, frequency_hz: int) -> None:
-    """Begin a control step of all cars whose drives go on: set the steering actions, `steers` (N,)
-    clipped to [-1, 1], and add the effect of the wind over 1 / `frequency_hz` s to the velocities.
+    """Begin a control step of all cars whose drives go on. The steering actions are set to `steers`
+    (N,), clipped to [-1, 1], and the effect of the wind over 1 / `frequency_hz` s is added to the
+    cars' velocities.
 
     `fleet` has the arrays of the N cars (`Fleet.arrays`), `rides` the arrays of their drives.
     """
@@ -150,8 +152,9 @@ def observe_ride(number: int, step: int, car: FloatArray, rides: RideArrays) -> 
     """Fill `rides.seen[number]` with the observation of `car`, row `number` of the fleet, at the
     control step `step`.
 
-    The road is observed with the delay of the perception, the car's motion without delay; noise is
-    added. Until the delay is over, the offset and the angle are 0, and the road is straight.
+    The road is observed with the delay of the perception, the car's motion without delay. Noise is
+    added if `rides.noisy` is set. In the steps before the first delayed observation, the offset and
+    the angle are 0, and the road is straight.
     """
     seen, track = rides.seen[number], car[TRACK_AT:]
     at = step - rides.delays[number]

@@ -39,7 +39,7 @@ from trackfeatures.camera import CameraParameters
 
 FREQUENCY_HZ = 20
 SCORED_STEPS = {"forza": 6500, "alpine-2": 4500, "eroad": 3700, "g-track-3": 3300}
-"""The paper's number of steps for each of its tracks."""
+"""The paper's number of control steps of a drive on each of its four tracks."""
 GRID_SHARE = 1.0 / 6.0
 """Distance of TORCS's first grid position to the right of the track's centre, as a share of the
 track's width."""
@@ -93,7 +93,8 @@ def drive(
     lane = choose_lane(config, road)
     steps = steps_for(config.steps, track.name, track.length_m)
     noisy = config.perception != "truth"
-    # Answers to images are predicted to the present; the delay of a disturbance is not known.
+    # Answers to images are predicted to the present, so they have no delay for the controller. A
+    # disturbance can add a delay that the controller does not know.
     delay_s = 0.0 if noisy and disturbance is None else None
     loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy, delay_s=delay_s)
     if parameters is None:
@@ -138,7 +139,8 @@ def _check_film(path: Path) -> None:
 def _real_time(
     config: DriveConfig, perceive: Perceive, disturbance: Disturbance
 ) -> RealTimePerception[World, Any, Any]:
-    """Return `perceive` in real time. Raises UserError if a delay is simulated at the same time."""
+    """Return a perception that calls `perceive` in real time. Raises UserError if `config` or
+    `disturbance` also simulates a delay."""
     if config.latency_ms or disturbance.delay_s:
         raise UserError(
             "--realtime measures the delay of the answers; leave it out, or --latency-ms"
@@ -181,11 +183,11 @@ def choose_pedals(config: DriveConfig, road: Road, lane: Lane) -> Pedals:
 
 
 def delay(config: DriveConfig, perceive: Perceive, unknown_s: float = 0.0) -> Perceive:
-    """Return `perceive` with the latency and the lost answers that `config` sets; answers with a
-    large standard deviation get less weight.
+    """Return `perceive` with the latency and the lost answers that `config` sets. Answers of a
+    model with a large standard deviation get less weight.
 
-    The answers are late by another `unknown_s` s if this is above 0. The state is predicted over
-    the latency, but not over `unknown_s`.
+    `unknown_s` (s) is an additional delay that the controller does not know: the state is predicted
+    over the latency, but not over `unknown_s`.
     """
     late = partial(
         LatePerception,
@@ -221,7 +223,7 @@ def read_parameters(path: Path | None, controller: str) -> dict[str, float]:
 
 
 class LastAnswer:
-    """A perception that keeps its last answer for the observers."""
+    """Calls a perception and keeps its last answer, which the observers of the drive read."""
 
     def __init__(self, perceive: Perceive) -> None:
         self._perceive = perceive
@@ -263,7 +265,8 @@ def _observers(
 def _recorder(
     perceive: LastAnswer, observers: list[Observer], steps: int, progress: Progress | None
 ) -> Callable[[CarState, float], None]:
-    """Return a function that calls the observers and reports the progress."""
+    """Return a function that calls the `observers` and `progress`. `run_lap` calls this function in
+    each of the `steps` control steps."""
     done = itertools.count()
 
     def record(state: CarState, steer: float) -> None:

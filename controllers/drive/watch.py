@@ -17,11 +17,11 @@ def watch(
     """Serve the page at port `config.watch`; yield a function that shows the present state of
     `world` and a perceived road.
 
-    The function is called once for each control step. It keeps the drive in real time, unless
-    `config.realtime` does so already. `lane_centre` is the line to follow, m left of the track's
-    centre. Raises UserError when the port is in use.
+    Call the function once for each control step. It waits so that the drive runs in real time,
+    except with `config.realtime`, which keeps the drive in real time by itself. `lane_centre` is
+    the line to follow, m left of the track's centre. Raises UserError when the port is in use.
     """
-    # A drive on the wall clock is in real time already.
+    # A drive with `realtime` is in real time already.
     speed = None if config.realtime else 1.0
     port = 0 if config.watch is None else config.watch
     with Watcher(port=port, light=config.light, speed=speed, seed=config.seed) as watcher:

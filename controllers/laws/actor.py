@@ -40,11 +40,11 @@ class ActorCard:
     state: str
     """Name of the definition of the state vector."""
     parts: tuple[str, ...]
-    """Names of the numbers of the state, in their order."""
+    """Names of the numbers of the state vector, in their order."""
     half_width_m: float
     """Half the width of the track of the training; it divides the lateral offset."""
     divisor: tuple[float, ...]
-    """Divisors of the numbers of the state, applied before the network."""
+    """Divisors of the numbers of the state vector; the network receives the quotients."""
     odd: bool
     """Whether the action is half the difference between the network's outputs for the state and for
     its mirror image."""
@@ -55,8 +55,8 @@ class ActorCard:
     step: int
     """Step of the training after which this actor was saved."""
     score_per_step: float
-    """Mean reward per step of the actor's drive on the training track; the actor with the largest
-    mean is kept."""
+    """Mean reward per step of the actor's evaluation drives (for one car: the drive on the training
+    track). The actor with the largest mean is kept."""
     reward: str = "paper"
     """Name of the reward of the training."""
     format: int = FORMAT
@@ -75,7 +75,7 @@ class Actor:
         self.weights = weights
         self.definition = find_state(card.state)
         first = (weights["w1"] / np.array(card.divisor)[:, None]).astype(np.float32)
-        if card.odd:  # one product computes the layer for the state and for its mirror image
+        if card.odd:  # one product computes the first layer for the state and its mirror image
             order, signs = mirror_of(self.definition)
             mirrored = np.empty_like(first)
             mirrored[order] = first * signs[:, None]

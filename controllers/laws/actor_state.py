@@ -7,8 +7,8 @@
   and the last two steering actions. The curvature of the road can be inferred from `stacked`, but
   not from `paper`. LQR also receives the yaw rate.
 - `residual` has the numbers of `stacked` and the steering of the controller `lqr`. The car is
-  steered by that steering plus 0.3 times the actor's action (residual reinforcement learning,
-  Johannink et al. 2019).
+  steered by the steering of `lqr` plus 0.3 times the actor's action (residual reinforcement
+  learning, Johannink et al. 2019).
 - `history` has the paper's state of the present step, and the differences between the states of
   the seven steps before and the present state. Noise, delay and the car's motion can be inferred.
 
@@ -28,7 +28,8 @@ from trackfeatures.state_vector import state_vector
 
 Vector = NDArray[np.float32]
 STEP_S = 0.05
-"""The control step of the trainings; an actor drives at the same rate."""
+"""Duration (s) of a control step in the trainings; an actor must drive with the same control
+step."""
 EXACT = LoopConfig(STEP_S)
 RESIDUAL_REACH = 0.3
 """Steering action that the actor's action 1 adds to the steering of LQR. A bend of 25 m radius
@@ -120,14 +121,16 @@ def paper_state(seen: Observation, half_width: float) -> Vector:
 
 
 def history_state(recent: Vector) -> Vector:
-    """Return the state `history` (..., 56) from the paper's states (..., 8, 7), newest first."""
+    """Return the state `history` (..., 56) from the paper's states (..., 8, 7) of the last eight
+    steps, newest first."""
     now, before = recent[..., :1, :], recent[..., 1:, :]
     whole: Vector = np.concatenate((now, before - now), axis=-2)
     return whole.reshape(*recent.shape[:-2], HISTORY.size)
 
 
 class StateBuilder:
-    """Builds the state of each step of one drive; it stores the values that later states need."""
+    """Builds the state vector of each control step of one drive, and stores the values that the
+    states of later steps need."""
 
     def __init__(self, definition: StateDefinition, loop: LoopConfig = EXACT) -> None:
         self._plain = definition.name == PAPER.name
@@ -167,8 +170,8 @@ class StateBuilder:
         return np.array(numbers, np.float32)
 
     def steer(self, action: float) -> float:
-        """Return the steering in [-1, 1] for the actor's action in the state that `build` returned
-        last."""
+        """Return the steering in [-1, 1] for the `action` that the actor chose in the state that
+        the last call of `build` returned."""
         if self._lqr is not None:
             action = min(max(self._lqr_steer + RESIDUAL_REACH * action, -1.0), 1.0)
         self._steers = (action, self._steers[0])

@@ -22,20 +22,21 @@ Vector = NDArray[np.float64]
 MAX_DELAY = 4
 """Longest delay in control steps: 0.2 s at 20 Hz."""
 SPANS = (1, 4)
-"""Control steps over which second differences are taken. Short spans are exact without noise. Long
-spans contain more of the motion and no more of the noise."""
+"""Control steps over which second differences are taken. With a short span the estimate is exact if
+there is no noise. A second difference over a long span contains more of the car's motion but no
+more noise."""
 LONGEST = max(SPANS)
 WINDOW, FEWEST = 200, 20
 """Largest and least number of control steps whose residuals are compared."""
 SURE = 3.5
-"""Number of standard errors by which a delay must explain the measurements better than any
-other."""
+"""Number of standard errors by which a delay must explain the measurements better than any other
+delay."""
 
 DELAY_MEMORY = np.dtype(
     [
         # The delay that is assumed: 0 until the measurements contradict it.
         ("steps", np.int64),
-        # Whether the delay was given, or the measurements ever separated it from all other delays.
+        # Whether the delay was given, or the measurements have separated one delay from all others.
         ("is_known", np.bool_),
         ("is_given", np.bool_),
         ("count", np.int64),

@@ -36,15 +36,17 @@ CAR = LateralModel(
 """The car with its fuel. Yaw inertia and tyre stiffness are estimated from the recorded TORCS laps
 (`simulator.vehicle.car`); the paper's values differ."""
 PROCESS_STD = np.array([0.003, 0.0007, 0.02, 0.02, 0.0005])
-"""Standard deviations of the model's error (e, theta, vy, r, kappa) per step, from USUAL_M_S on."""
+"""Standard deviations of the model's error (e, theta, vy, r, kappa) per control step, at speeds of
+at least USUAL_M_S."""
 USUAL_M_S, SLOWEST_SHARE = 15.0, 0.1
-"""Below USUAL_M_S the standard deviations PROCESS_STD fall in proportion to the speed, to a tenth
-at least: the state of a slow car changes less in a control step."""
+"""Below USUAL_M_S (m/s) the standard deviations fall in proportion to the speed, but not below a
+tenth of PROCESS_STD, because the state of a slow car changes less in a control step."""
 START_STD = np.array([0.1, 0.05, 0.1, 0.1, 0.02])
 LEAST_STD = np.array([1e-3, 2e-4, 1e-2, 1e-3])
 MOST_STD = np.array([0.2, 0.02, 0.12, 0.012])
-"""Lower and upper limits of the measurements' standard deviations (e, theta, vy, r). Because of the
-upper limits each sensor always has some weight, and an oscillating car is not taken for noise."""
+"""Lower and upper limits of the standard deviations of the measurements' noise (e, theta, vy, r).
+Because of the upper limits each sensor always has some weight, and the motion of an oscillating car
+is not taken for noise."""
 NOISE_STEPS = 100
 """Control steps over which the variance of the noise is averaged."""
 THIRD_DIFFERENCE = 20.0
@@ -55,7 +57,7 @@ STATE_MEMORY = np.dtype(
     [
         ("x", np.float64, STATES),
         ("covariance", np.float64, (STATES, STATES)),
-        # vx, vy, yaw rate, wheel angle; newest first.
+        # vx, vy, yaw rate and wheel angle of the last control steps, newest first.
         ("own", np.float64, (MAX_DELAY + 2, 4)),
         ("recent", np.float64, (4, MEASURED)),
         # Variance of the noise of (e, theta, vy, r), without limits.
@@ -205,7 +207,8 @@ def _transition(speed: float, dt: float) -> Vector:
     block = np.zeros((STATES + 1, STATES + 1))
     block[E, THETA], block[E, V] = speed, 1.0
     block[THETA, R], block[THETA, KAPPA] = 1.0, -speed
-    # The model's rates are e' = vy + vx theta and theta'. Its columns of e' are the columns of vy.
+    # `LateralModel` has the state e' = vy + vx theta in place of vy, so the derivatives with
+    # respect to e' are the derivatives with respect to vy.
     block[V, V], block[V, R] = lateral[1, 1], turn[1, 0]
     block[R, V], block[R, R] = lateral[3, 1], lateral[3, 3]
     block[V, STATES], block[R, STATES] = wheel[1, 0], wheel[3, 0]

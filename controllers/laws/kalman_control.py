@@ -1,9 +1,9 @@
 """LQR and MPC on an estimated state: for a perception with noise, delay, or both.
 
-Both act on the state that `controllers.laws.kalman` estimates: the present offset and heading
-error, lateral speed and yaw rate without their noise, and the curvature of the road. The paper's
-controllers use the perceived values unchanged: with 5 cm of noise they steer to and fro, and with a
-delay of 0.1 s they oscillate.
+Both controllers act on the state that `controllers.laws.kalman` estimates: the present offset and
+heading error, lateral speed and yaw rate without their noise, and the curvature of the road. The
+paper's controllers use the perceived values unchanged: with noise of 5 cm (standard deviation) they
+steer to and fro, and with a delay of 0.1 s they oscillate.
 
 `LqrKalman` (`lqr-kalman`) minimises the paper's cost plus `wheel_rate` times the squared change of
 the wheel angle in a control step; the wheel angle is a fifth state. The wheel angle and heading of
@@ -47,7 +47,7 @@ APPROACH_RAD = 0.3
 WEIGHTS, WHEEL_RATE = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01), 3.0
 """Weights of the paper's cost and of the squared change of the wheel angle in a control step."""
 WEIGHTS_UNKNOWN_DELAY, WHEEL_RATE_UNKNOWN_DELAY = LqrWeights(1.0, 1.0, 5.0, 1.0, 10.0), 0.3
-"""The same weights, used until the delay is known."""
+"""Weights of the same two terms, used until the delay is known."""
 MPC_WEIGHTS = MpcWeights(1.0, 3.0, 0.3)
 
 
@@ -169,7 +169,8 @@ def smooth_gain(weights: LqrWeights, wheel_rate: float, speed: float, dt: float)
     states = np.block([[A, B], [np.zeros((1, 4)), np.eye(1)]])
     change = np.vstack([B, [[1.0]]])
     Q = np.diag([*np.diag(weights.Q), weights.rho])
-    # The wheels are held at their new angle: rho (wheel + change)^2 has a mixed term.
+    # The wheels have the new angle, wheel + change, during the step, so the cost
+    # rho (wheel + change)^2 has a mixed term.
     mixed = np.array([[0.0], [0.0], [0.0], [0.0], [weights.rho]])
     R = np.array([[weights.rho + wheel_rate]])
     P = solve_discrete_are(states, change, Q, R, s=mixed)

@@ -31,8 +31,9 @@ class LateralModel:
     rear_stiffness: float = 80_000.0
 
     def matrices(self, speed: float) -> tuple[Matrix, Matrix, Matrix]:
-        """Return A (4, 4), B (4, 1) and turn (4, 1) of x' = A x + B delta + turn * road's turning
-        rate (rad/s), with the wheel angle delta (rad), at `speed` m/s."""
+        """Return A (4, 4), B (4, 1) and turn (4, 1) of x' = A x + B delta + turn * w at `speed`
+        m/s, with the wheel angle delta (rad) and the turning rate w (rad/s) of the road, which is
+        the speed times the road's curvature."""
         m, inertia, lf, lr = self.mass, self.yaw_inertia, self.front_axle, self.rear_axle
         front, rear = 2.0 * self.front_stiffness, 2.0 * self.rear_stiffness
         total, moment = front + rear, -front * lf + rear * lr

@@ -58,7 +58,8 @@ from controllers.perception.curvature import next_curvature
 from runtime.jit import compiled, compiled_for_threads
 
 WEIGHTS_PAPER = LqrWeights(2.0, 0.2, 2.0, 0.1, 0.01)
-"""The paper's weights for forza and g-track-3 (second rows of its table)."""
+"""The paper's LQR weights for the tracks forza and g-track-3 (second rows of the paper's table of
+weights)."""
 WEIGHTS_EXACT = LqrWeights(10.0, 0.2, 10.0, 0.1, 0.01)
 """Weights of `Lqr` on the exact state: without preview, a higher gain on the offset keeps it small
 in bends (score per step on eroad: 0.9792, with the paper's weights 0.9782)."""
@@ -75,7 +76,8 @@ UNLIMITED_RAD = 1e6
 """The value of `approach_rad` that sets no limit, for the exact state."""
 LOCK_DEG = 21.0
 RATE = 3
-"""Size of the memory of `next_rate`: 1 after the first value, else 0; the last value; the rate."""
+"""Number of values in the memory of `next_rate`: 1 after the first value, else 0; the last value;
+and the rate."""
 
 
 def make_lqr(loop: LoopConfig, **weights: float) -> "Lqr":
@@ -107,7 +109,8 @@ def approach_limit(loop: LoopConfig) -> float:
 
 
 class Lqr(BatchController):
-    """The paper's regulator at a control step of `dt` s; all gains are computed at the start."""
+    """The paper's regulator at a control step of `dt` s. All gains are computed when the object is
+    made."""
 
     def __init__(
         self,
@@ -161,7 +164,8 @@ class LqrPreview(BatchController):
 
 
 class LqrPaper(BatchController):
-    """The regulator of the paper's released code, which steers 57 times less than demanded."""
+    """The regulator of the paper's released code. It steers 57 times less than its gains demand,
+    because the code divides an angle in rad by the steering lock in degrees."""
 
     def __init__(
         self,
@@ -196,8 +200,8 @@ def regulate(
     for k in range(len(seen)):
         vx, theta = seen[k, VX], -seen[k, ANGLE]
         gain = row_at(gains, vx)
-        # The yaw rate alone is not e2', because the road turns in a bend.
-        # At the limit the terms of the offset and of the heading are equal.
+        # e2' is the rate of theta, not the yaw rate, because the road turns in a bend.
+        # The limit of the offset's term is the heading's term at theta = `approach_rad`.
         steers[k] = steer_for(
             -(
                 limited(gain[0] * seen[k, TO_LANE_CENTRE], gain[2] * approach_rad)

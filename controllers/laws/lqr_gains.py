@@ -17,7 +17,8 @@ divides by the speed."""
 
 @dataclass(frozen=True)
 class LqrWeights:
-    """Weights of the cost: Q = diag(offset, offset_rate, heading, heading_rate), R = rho."""
+    """Weights of the regulator's cost: Q = diag(offset, offset_rate, heading, heading_rate) for the
+    state (m, m/s, rad, rad/s), and R = rho for the wheel angle (rad)."""
 
     offset: float
     offset_rate: float

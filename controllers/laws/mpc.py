@@ -48,7 +48,7 @@ from simulator.vehicle.car import CarParameters
 Vector = NDArray[np.float64]
 
 HORIZON = 10
-"""Control steps of a plan; the paper compares 8, 10 and 12."""
+"""Number of control steps of a plan; the paper compares 8, 10 and 12 steps."""
 REAR_AXLE_M, WHEELBASE_M = CarParameters.rear_axle, CarParameters().wheelbase
 CURVATURE_FILTER_S = 0.4
 MAX_ITERATIONS = 30
@@ -67,8 +67,9 @@ class MpcWeights:
 
 WEIGHTS_PAPER = MpcWeights(1.0, 1.0, 1.0)
 WEIGHTS_EXACT = MpcWeights(1.0, 3.0, 0.03)
-"""Weights tuned on the exact state of the four scored tracks. With three times the weight on the
-offset the car begins to oscillate, because it turns more slowly than the kinematic model."""
+"""Weights tuned in drives with the exact state on the paper's four tracks. With three times this
+weight of the offset the car begins to oscillate, because it turns more slowly than the kinematic
+model."""
 WEIGHTS_PERCEIVED = MpcWeights(1.0, 20.0, 2.0)
 
 
@@ -88,7 +89,8 @@ def _weights(loop: LoopConfig) -> MpcWeights:
 
 
 class Mpc(BatchController):
-    """Model predictive control at a control step of `dt` s; it keeps the last solution."""
+    """Model predictive control at a control step of `dt` s. Each solve starts from the last
+    solution, which the object keeps."""
 
     def __init__(
         self,
@@ -182,8 +184,8 @@ def backward_pass(
     cost: Vector,
     steps: Vector,
 ) -> None:
-    """Fill `steps` (n, 3), from the last step of `plan` to the first, with the improvement of each
-    step.
+    """Fill `steps` (n, 3) with the improvement of each step of `plan`, from the last step to the
+    first.
 
     A row has the change of the wheel angle (rad), limited so that the angle stays within the
     steering lock, and the feedback gains of the wheel angle on changes of y and psi. `plan`,
@@ -239,9 +241,9 @@ def solve(
 ) -> int:
     """Replace `plan` (n,), front wheel angles in rad, by the best plan; return the iterations used.
 
-    `offset` (m) and `heading` (rad, counter-clockwise) are relative to the lane; `speed` is in m/s,
-    `curvature` of the reference in 1/m; `cost` (3,) has the weights of offset, heading and wheel
-    angle.
+    `offset` (m, left positive) and `heading` (rad, counter-clockwise) are relative to the lane.
+    `speed` is in m/s, the control step `dt` in s, the `curvature` of the reference in 1/m. `cost`
+    (3,) has the weights of offset, heading and wheel angle.
     """
     n = len(plan)
     states, trial = np.zeros((n + 1, 2)), np.zeros((n + 1, 2))

@@ -1,4 +1,4 @@
-"""A controller that steers by a trained actor; an `update` takes three small matrix products."""
+"""A controller that steers by a trained actor. An `update` computes three small matrix products."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ above 0.25 rad."""
 
 
 class RlController:
-    """Steers by the actions of `actor`, without noise."""
+    """Steers by the actions of `actor`. No noise is added to the actions."""
 
     def __init__(self, actor: Actor, loop: LoopConfig = EXACT) -> None:
         self._actor, self._loop = actor, loop
@@ -36,7 +36,8 @@ class RlController:
         return self._states.steer(self._actor.steer(self._states.build(paper, observation)))
 
     def update_batch(self, observations: Observations) -> NDArray[np.float64]:
-        # Each car separately: the rounding of a matrix product depends on the number of rows.
+        # The cars are computed one by one, because the rounding of a matrix product depends on the
+        # number of its rows.
         if len(self._cars) != len(observations):
             self._cars = [RlController(self._actor, self._loop) for _ in range(len(observations))]
         pairs = zip(self._cars, observations.split(), strict=True)

@@ -1,9 +1,9 @@
 """Pedals that hold a set speed (`controllers drive --speed`) and slow down in bends and traffic.
 
 The speed law of the scripted drivers (`simulator.driving.speed`) sets throttle, brake and gear.
-This module limits its target speed to what the road allows. The limit follows from the curvature
-ahead with exact states, and from the class of the road and the car's yaw rate with a model's
-answers. SI units, left positive.
+This module limits the target speed of this law to the speed that the road allows. With exact states
+the limit is computed from the curvature ahead, with a model's answers from the class of the road
+and the car's yaw rate. SI units, left positive.
 """
 
 import math
@@ -21,15 +21,17 @@ from trackfeatures import RoadClass
 from trackfeatures.errors import UserError
 
 SLOWEST, FASTEST = 1.0, 40.0
-"""Limits of the set-point (m/s); the car reaches 50 m/s in fourth gear, the highest gear used."""
+"""Lowest and highest set speed (m/s). The car reaches 50 m/s in fourth gear, the highest gear that
+is used."""
 SETTLED_S, GAINING = 4.0, 1.5
-"""The speed error counts after the road has been free for SETTLED_S (s) plus the time to reach the
-set-point at an acceleration of GAINING (m/s2)."""
+"""The speed error counts only after the road has been free for SETTLED_S (s) plus the time in which
+the car reaches the set speed at an acceleration of GAINING (m/s2)."""
 NEW_BEND_RADIUS_M, NEW_BEND_S = 60.0, 2.0
 """Assumed radius (m) of a bend for the first NEW_BEND_S (s) after the class of the road announces
 the bend. From then on the curvature is estimated from the car's motion."""
 CLASS_FILTER_S = 0.15
-"""Time constant (s) of the low-pass filter on the class, so that one wrong answer has no effect."""
+"""Time constant (s) of the low-pass filter on the class of the road. Because of the filter one
+wrong answer has no effect."""
 
 AllowedSpeed = Callable[[CarState, Perceived], float]
 """A function that returns the speed (m/s) that the road allows; inf for no limit."""

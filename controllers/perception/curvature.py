@@ -1,4 +1,5 @@
-"""Estimates the curvature of the road from the car's motion if the perception has no curvature."""
+"""Estimates the curvature of the road from the car's motion, for a perception that does not measure
+the curvature."""
 
 from dataclasses import dataclass
 

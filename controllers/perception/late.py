@@ -1,8 +1,8 @@
 """Perception with latency and lost answers; the state is predicted until an answer arrives. SI
 units.
 
-An answer describes the moment of its image. The car moves on until it arrives, so the offset and
-the angle are predicted to the present from the car's own speeds and yaw rate:
+An answer describes the moment of its image. The car moves on until the answer arrives, so the
+offset d and the angle are predicted to the present from the car's own speeds and yaw rate:
 
     d' = vx sin(theta) + vy cos(theta), theta' = yaw rate - curvature * vx   (theta = -angle)
 """
@@ -65,7 +65,7 @@ class StatePredictor:
         past = moments[-age - 1 : len(moments) - until]
         offset, theta = answer.to_lane_centre, -answer.angle
         for before, after in itertools.pairwise(past):
-            # The mean over the step: the motion at its begin and at its end is measured.
+            # The mean motion in the step: the motion is measured at the step's begin and end.
             vx, vy = 0.5 * (before.vx + after.vx), 0.5 * (before.vy + after.vy)
             curvature = before.curvature if answer.curvature is None else answer.curvature
             turn = 0.5 * (before.yaw_rate + after.yaw_rate) - curvature * vx
@@ -127,7 +127,8 @@ class RoadEstimate:
 
 
 class TrustedPerception(Generic[World]):
-    """A perception without latency, whose answers are fused with the state estimate.
+    """A perception without latency. The answers of the given perception are fused with the state
+    estimate.
 
     Answers without a standard deviation or without an offset are returned unchanged.
     """

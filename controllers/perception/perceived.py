@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """The road at one control step."""
+    """The road at one control step, as a perception measures or estimates it."""
 
     to_lane_centre: float | None
     """Offset (m) from the centre of the lane to follow; None if no marking is visible."""
@@ -21,7 +21,8 @@ class Perceived:
     curvature: float | None = None
     """Curvature (1/m) of the road just ahead; None if the perception does not estimate it."""
     lost_s: float = 0.0
-    """Time (s) for which answers have been late or untrusted; 0 if this step's answer is there."""
+    """Time (s) for which answers have been late or have had little weight; 0 if the answer for this
+    control step arrived in time and is trusted."""
     offset_std_m: float | None = None
     """Standard deviation of the error of `to_lane_centre`; None if it is not estimated."""
     angle_std_rad: float | None = None

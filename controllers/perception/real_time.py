@@ -83,9 +83,10 @@ class ImmediateAnswers(Generic[Answer]):
 
 
 class RequestThread(Generic[Frame, Answer]):
-    """A thread that requests answers, one at a time; a newer frame replaces the waiting frame.
+    """A thread that requests answers, one at a time. Only one frame waits for its request: a newer
+    frame replaces it.
 
-    The next `take` raises the errors of `ask`.
+    An error that `ask` raises in the thread is raised by the next call of `take`.
     """
 
     def __init__(self, ask: Callable[[Frame], Answer], clock: Clock = time.monotonic) -> None:
@@ -122,18 +123,19 @@ class RealTimeFigures:
     """Times of the answers and of the control steps of a drive in real time."""
 
     late_answers: int
-    """Answers that took longer than a control step."""
+    """Number of answers that took longer than a control step."""
     lost_answers: int
-    """Answers that were dropped on purpose (--drop)."""
+    """Number of answers that were dropped on purpose (option --drop)."""
     answer_ms_median: float
-    """Time from an image to its answer."""
+    """Median time (ms) from an image to its answer. `answer_ms_p99` is the 99th percentile."""
     answer_ms_p99: float
     age_ms_median: float
-    """Age of the newest answer at a control step."""
+    """Median over the control steps of the age (ms) of the newest answer, counted from its image.
+    `age_ms_p99` is the 99th percentile."""
     age_ms_p99: float
     missed_steps: int
-    """Control steps that took longer than their 50 ms, or began late because an earlier step
-    did."""
+    """Number of control steps that took longer than their 50 ms, or began late because an earlier
+    step took too long."""
 
 
 class RealTimePerception(Generic[World, Frame, Answer]):
@@ -197,7 +199,7 @@ class RealTimePerception(Generic[World, Frame, Answer]):
     def _know(self, world: World, newest: Perceived | None, age: int) -> Perceived:
         self._estimate.update(self._state(world), newest, age)
         self._ages_s.append(self._clock() - self._requested_s)
-        # The answer to the image of the last step is not late.
+        # An answer to the image of the preceding control step is not late.
         return self._estimate.present(due=1)
 
     def figures(self) -> RealTimeFigures:
@@ -224,7 +226,7 @@ class RealTimePerception(Generic[World, Frame, Answer]):
 def real_time(
     perceive: Perceive, *, dt: float, drop: float, rng: np.random.Generator
 ) -> RealTimePerception["SimulatedWorld", Any, Any]:
-    """Return a perception that asks `perceive` in real time, once for each control step of `dt` s.
+    """Return a perception that calls `perceive` in real time, once for each control step of `dt` s.
 
     A share `drop` of the answers, random by `rng`, is lost. Only a perception with a camera takes
     time to answer. Raises UserError unless `drop` is at least 0 and below 1.

@@ -101,9 +101,9 @@ class ServiceModel:
 
 
 def parse_camera(content: Any) -> CameraParameters:
-    """Read the camera in a service's model card, a dictionary with the sides in px, the position in
-    m, and the field of view and pitch in deg. Raises UserError if a value is missing or no
-    number."""
+    """Read the camera in a service's model card. `content` is a dictionary with the image's width
+    and height in px, the position in m, and the field of view and pitch in deg. Raises UserError if
+    a value is missing or is no number."""
     try:
         return CameraParameters(
             width=int(content["width"]),
@@ -122,7 +122,7 @@ def parse_camera(content: Any) -> CameraParameters:
 
 
 class CameraPerception:
-    """Perception by a camera on the car and a network that evaluates its images."""
+    """Perception by a camera on the car and a network that computes the features of its images."""
 
     def __init__(self, camera: "Camera", model: FeatureModel) -> None:
         self.camera = camera

@@ -30,7 +30,7 @@ OFFSET_NOISE_M, ANGLE_NOISE_RAD = 0.01, 0.01
 """Process noise: standard deviations per control step of errors of the propagation, such as the
 unknown curvature of the road."""
 TRUSTED_GAIN = 0.1
-"""An answer with a lower gain on the offset counts as a lost answer."""
+"""An answer whose gain on the offset is lower counts as a lost answer."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Trust:
         """Fuse `answer` with the state estimate `known` and return the new state estimate.
 
         `known` has been propagated over `steps` control steps and `moved_m` metres since the last
-        answer. It is None before the first answer and after a long time without one.
+        answer. It is None before the first answer, and if the last answer is more than 1 s old.
         """
         if answer.offset_std_m is None or answer.angle_std_rad is None:
             return answer
@@ -77,6 +77,6 @@ class Trust:
 
 
 def _joseph(variance: float, gain: float, std: float) -> float:
-    """Return the variance after the fusion, with any `gain`, with a measurement whose standard
-    deviation is `std` (Joseph form)."""
+    """Return the variance of an estimate of variance `variance` after its fusion with a measurement
+    of standard deviation `std`. The formula (Joseph form) is correct for any `gain`."""
     return (1.0 - gain) ** 2 * variance + gain**2 * std**2

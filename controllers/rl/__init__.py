@@ -18,10 +18,11 @@ last hidden layer, as in the paper. Deviations from the paper, and settings that
 
 `td3` has further differences: two critics, target noise of 0.02, an update of the actor after every
 second update of the critics, no noise on the state, discount of 0.95, tau of 0.005, learning rates
-that fall to 5 %. Its reward is 4 (r - 1) with the paper's reward r, which is 0 in all steps after a
-terminal state; the optimal policy is the same. The inputs of its networks are divided by their
-typical spread. Left and right are exchanged in half of the transitions, and the actor is odd by
-construction. Its episodes have 400 steps and begin at random places and motions.
+that fall to 5 %. Its reward is 4 (r - 1), where r is the paper's reward; in all steps after a
+terminal state r is 0. The optimal policy is the same. The inputs of its networks are divided by
+their typical spread. Left and right are exchanged in half of the transitions, and the actor is odd
+by construction. Its episodes have 400 steps; nine of ten begin at a random place with a random
+motion.
 
 `ppo` (`controllers.rl.ppo`) always drives many cars, on all tracks and random roads. `ddpg` and
 `td3` can also drive many cars (`--envs 256`). Then an update has 256 transitions, and there is one

@@ -7,7 +7,8 @@ from controllers.laws.actor_state import STEP_S
 
 Array = NDArray[np.float32]
 SLOWEST_M_S = 1.0
-"""Least speed for the discount factor, which would be 1 for a car at rest."""
+"""Lower bound (m/s) of the speed from which the discount factor is computed. Without this bound the
+discount factor of a car at rest would be 1."""
 
 
 def advantages_of(
@@ -21,10 +22,11 @@ def advantages_of(
 ) -> Array:
     """Return the generalised advantage estimates (T, N) of T steps of N cars.
 
-    All arrays are (T, N). `values`, `next_values`: values of the states before and after the steps,
-    the latter before any reset. `ended`: the step reached a terminal state, whose value is 0.
-    `over`: the step was the last one of its episode, so later steps do not count. `discounts`:
-    discount factor of each step. `gae_lambda`: lambda of Schulman et al., 0 to 1.
+    All arrays are (T, N). `values` are the values of the states before the steps, `next_values` of
+    the states that the steps reached (not of the first states of new episodes). `ended`: whether
+    the step reached a terminal state, whose value is 0. `over`: whether the step was the last step
+    of its episode, so that later steps do not count. `discounts`: discount factor of each step.
+    `gae_lambda`: lambda of Schulman et al., 0 to 1.
     """
     found = np.zeros_like(rewards)
     errors = rewards + discounts * next_values * ~ended - values

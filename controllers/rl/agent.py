@@ -14,7 +14,7 @@ TARGET_NOISE_CUT = 2.5  # standard deviations; TD3 clips noise of 0.2 at 0.5
 
 
 class Replay:
-    """The last `capacity` transitions, with states of `size` numbers."""
+    """Stores the last `capacity` transitions; a state has `size` numbers."""
 
     def __init__(self, capacity: int, size: int) -> None:
         self.states = np.zeros((capacity, size), np.float32)
@@ -30,8 +30,8 @@ class Replay:
     def add(
         self, state: Array, action: float, reward: float, next_state: Array, ended: bool
     ) -> None:
-        """Store a transition between states (size,); it overwrites the oldest one when the replay
-        is full."""
+        """Store the transition from `state` (size,) to `next_state` (size,). When the replay is
+        full, it overwrites the oldest transition."""
         place = self.added % len(self.states)
         self.states[place], self.next_states[place] = state, next_state
         self.results[place] = action, reward, ended
@@ -71,8 +71,8 @@ class Agent:
         self._order, self._signs = mirror_of(definition)
 
     def see(self, state: Array) -> Array:
-        """Return the input of the networks for states (..., size): the states divided by their
-        typical size, if the algorithm scales them."""
+        """Return the input of the networks for states (..., size). If the algorithm is `scaled`,
+        each number of a state is divided by its typical size."""
         return np.asarray(state / self.divisor, np.float32)
 
     def act(self, seen: Array) -> float:
@@ -86,10 +86,12 @@ class Agent:
     def remember(
         self, seen: Array, action: float, reward: float, next_seen: Array, ended: bool
     ) -> None:
-        """Add a transition between inputs of the networks (size,) to the replay.
+        """Add the transition from `seen` (size,) to `next_seen` (size,) to the replay; both are
+        inputs of the networks.
 
-        The algorithm's `reward_baseline` is subtracted from the reward. A terminal state is
-        followed for ever by steps of reward 0, from which the baseline is subtracted, too.
+        The algorithm's `reward_baseline` is subtracted from the reward. If the episode `ended`, the
+        stored reward also contains the discounted sum of the following steps: after a terminal
+        state all steps have the reward 0, from which the baseline is subtracted, too.
         """
         of = self.algorithm
         value = reward - of.reward_baseline
@@ -112,7 +114,8 @@ class Agent:
     def weights(self) -> dict[str, Array]:
         """Return the arrays of an actor's file (w1, b1, w2, b2, w3, b3) for the target actor.
 
-        The target actor is an average over the last updates and steers more smoothly.
+        The target actor is an average of the actor over the last updates. It steers more smoothly
+        than the actor itself.
         """
         of = layers(self.actor.target.copy(), self.shape)
         flat = {name: array[0] for name, array in of._asdict().items()}

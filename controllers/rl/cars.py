@@ -49,8 +49,8 @@ STANDING = 0.4
 START = {"to_middle": (-2.0, 2.0), "angle": (-0.12, 0.12)}  # ranges, m and rad
 START_SPEED = (0.0, 18.0)  # range, m/s
 GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
-"""Multiples of the golden ratio modulo 1 are spread evenly for any number of tracks. They decide on
-which tracks the cars are disturbed."""
+"""Multiples of the golden ratio modulo 1 are spread evenly between 0 and 1, for any number of
+tracks. They determine on which tracks the cars are disturbed."""
 RANDOM_START_M = 3000.0
 """On random roads, which differ in length, the start is 0 to RANDOM_START_M (m) along the road."""
 
@@ -62,11 +62,11 @@ class Step:
     last: Array  # (N, size), the states after the step
     states: Array  # (N, size), as `last`, but the first states of cars in new episodes
     privileged: Array  # (N, privileged.SIZE), `privileged_state` before the step
-    last_privileged: Array  # (N, privileged.SIZE), the same after the step
+    last_privileged: Array  # (N, privileged.SIZE), `privileged_state` after the step
     rewards: NDArray[np.float64]  # (N,)
     ended: NDArray[np.bool_]  # (N,), whether the episode reached a terminal state
     over: NDArray[np.bool_]  # (N,), whether the episode ended, also by its number of steps
-    offsets_m: NDArray[np.float64]  # (N,), from the middle, left positive
+    offsets_m: NDArray[np.float64]  # (N,), from the middle of the road, left positive
 
 
 class Cars:
@@ -75,8 +75,8 @@ class Cars:
 
     `starts`: values of the start by name, each fixed or a range, for the environment's reset.
     `episode`: least and greatest number of steps of an episode. `half_width_m`: divisor of the
-    lateral offset. `image_errors`: the states of all cars that are not disturbed have errors like
-    those of the model on images (`IMAGE_ERRORS`).
+    lateral offset. `image_errors`: whether the states of all cars that are not disturbed have
+    errors like the errors of the model's answers to images (`IMAGE_ERRORS`).
     """
 
     def __init__(
@@ -178,7 +178,8 @@ class Cars:
         self._noise[new] = np.where(of, noises, 0.0)[new]
 
     def _perceive(self, observed: Array, info: dict[str, Any], new: NDArray[np.bool_]) -> Array:
-        """Return the states (N, size) with delay and noise, from the environment's observation.
+        """Return the states (N, size) with delay and noise. `observed` (N, 7) is the observation of
+        the environment and `info` its additional output.
 
         `new` (N,) marks cars in new episodes: their memory of earlier steps is filled with their
         present state. If any car is new, only the states of new cars are valid, and the memory of
@@ -217,8 +218,9 @@ class Cars:
             seen[:, :4] += drawn * (self._noise[:, None] * spread).astype(np.float32)
 
     def _next_image_errors(self, new: NDArray[np.bool_]) -> Array:
-        """Return the errors (N, 2) of offset and angle of this step, in the units of the state; 0
-        for cars without errors on images. Each error is a first-order autoregressive process."""
+        """Return the errors (N, 2) of offset and angle in this step, in the units of the state. The
+        errors are 0 for cars without image errors. Each error is a first-order autoregressive
+        process; the process starts anew for the `new` cars (N,)."""
         drawn = self._rng.standard_normal((self.count, 2), np.float32)
         shared, kept = np.float32(IMAGE_ERROR_CORRELATION), np.float32(IMAGE_ERROR_KEPT)
         drawn[:, 1] = shared * drawn[:, 0] + np.sqrt(1 - shared**2) * drawn[:, 1]

@@ -44,8 +44,8 @@ def train(config: TrainConfig, as_json: bool) -> None:
 def _continued(given: TrainConfig) -> TrainConfig:
     """Return the options stored in the folder `given.out`, with the threads of `given`.
 
-    Raises UserError if any other option of `given` differs from its default and from the stored
-    one.
+    Raises UserError if any other option of `given` differs both from its default and from the
+    stored option.
     """
     from controllers.rl.run_folder import UNCOMPARED, stored_config
 

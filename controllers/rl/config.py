@@ -15,7 +15,8 @@ EXPLORATION_STEPS = 400_000
 steps from EXPLORATION_FIRST to EXPLORATION_LEAST."""
 EXPLORATION_FIRST, EXPLORATION_LEAST = 1.0, 0.1
 QUADRATIC_SCALE = 5.0
-"""Factor on `reward_scale` for the quadratic reward, which is about five times smaller."""
+"""Factor on `reward_scale` for the quadratic reward, which is about five times smaller than the
+paper's first reward."""
 EXPLORATION_NOISE = 0.05
 """Standard deviation of the paper's noise on an action in [-1, 1], before the factor beta."""
 
@@ -25,17 +26,18 @@ class Algorithm:
     """The settings of an algorithm; the defaults are the settings of `ddpg`."""
 
     critics: int = 1
-    """Number of critics; the target uses the smallest of their values."""
+    """Number of critics. The critics' target is computed from the smallest of their values."""
     actor_delay: int = 1
-    """Updates of the critics per update of the actor."""
+    """Number of updates of the critics per update of the actor."""
     target_noise: float = 0.0
     """Standard deviation of the noise on the target action; the noise is clipped at 2.5 standard
     deviations."""
     discount: float = 0.99
     tau: float = 0.001
-    """Share of the networks' parameters in the soft update of the target networks."""
+    """Weight of the networks' parameters in the soft update of the target networks:
+    target <- tau * parameters + (1 - tau) * target."""
     batch: int = 64
-    """Transitions per update."""
+    """Number of transitions in the mini-batch of an update."""
     actor_rate: float = 1e-4
     critic_rate: float = 3e-4
     rate_end: float = 1.0
@@ -45,21 +47,22 @@ class Algorithm:
     state_noise: float = 0.05
     """Standard deviation of the noise on the state."""
     random_starts: bool = False
-    """Whether episodes have 400 steps from a random position and speed; the paper's episodes have
-    6500 steps."""
+    """Whether episodes have 400 steps and nine of ten begin at a random position and speed.
+    Otherwise all episodes have 6500 steps from the paper's start."""
     mirrored: bool = False
     """Whether left and right are exchanged in half of the transitions, and the actor's action
     changes its sign when they are exchanged in the state."""
     scaled: bool = False
     """Whether the networks' inputs are divided by their typical spread."""
     reward_baseline: float = 0.0
-    """Subtracted from every reward, also after a terminal state: the optimal policy is the same."""
+    """Number that is subtracted from every reward, also after a terminal state, so that the optimal
+    policy is the same."""
     reward_scale: float = 1.0
-    """Factor on the rewards."""
+    """Factor on every reward, after the baseline is subtracted."""
     hidden: tuple[int, int] = (64, 64)
     """Sizes of the two hidden layers."""
     replay: int = 400_000
-    """Transitions that the replay keeps."""
+    """Largest number of transitions that the replay keeps."""
     learning_starts: int = 1000
     """Transitions in the replay before the first update."""
 
@@ -88,14 +91,15 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """The settings of `ppo`. Fields without a description are named as in Schulman et al. 2017."""
+    """The settings of `ppo`. Fields without a description have the names of Schulman et al. 2016
+    and 2017, or are described in `Algorithm`."""
 
     discount_length_m: float = 15.0
     """The discount factor of a step is exp(-distance of the step / discount_length_m): 0.94 at
     65 km/h."""
     gae_lambda: float = 0.95
     horizon: int = 64
-    """Steps of each car between two updates."""
+    """Number of control steps of each car between two updates."""
     epochs: int = 4
     minibatches: int = 8
     clip: float = 0.2
@@ -104,7 +108,7 @@ class PpoSettings:
     rate_end: float = 0.0
     """Share of the learning rates that is left at the last step; they fall linearly."""
     max_gradient: float = 0.5
-    """Largest norm of the gradient, of the actor and of the critic."""
+    """Largest norm of a gradient, for the actor's gradient and the critic's gradient separately."""
     first_std: float = 0.14
     """Standard deviation of the steering actions at the start; it is learned, with a minimum of
     0.05."""
@@ -112,7 +116,7 @@ class PpoSettings:
     """Standard deviation of the noise on the paper's state."""
     reward_baseline: float = 1.0
     end_steps: int = 32
-    """Number of steps after a terminal state for which the baseline is subtracted, too."""
+    """Number of steps after a terminal state for which `reward_baseline` is subtracted, too."""
     reward_scale: float = 1.0
     hidden: tuple[int, int] = (64, 64)
 
@@ -122,7 +126,8 @@ SETTINGS: dict[str, Algorithm | PpoSettings] = {**ALGORITHMS, PPO: PpoSettings()
 
 
 def _defaults(name: str) -> str:
-    """Return the value of a setting for each algorithm as text, for the help of an option."""
+    """Return the values of the setting `name` of all algorithms as text, for the help of an
+    option."""
     return ", ".join(f"{key} {getattr(one, name):g}" for key, one in SETTINGS.items())
 
 
@@ -131,7 +136,8 @@ ALL_TRACKS = "all"
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training. Equal configurations give equal actors, bit for bit."""
+    """The options of one training. Two trainings with equal configurations give actors that are
+    equal bit for bit."""
 
     out: Annotated[Path, "Folder to write the actor, its curves and its checkpoint to."] = Path(
         "runs/rl"
@@ -242,7 +248,7 @@ def resolve(config: TrainConfig) -> TrainConfig:
     """Return `config` with the number of cars, the track, the steps and the steps between
     evaluations; a missing value gets the default for one car or for several cars.
 
-    Raises UserError for errors of images with one car.
+    Raises UserError if `image_errors` is set for a training with one car.
     """
     many = config.vectorised
     if config.image_errors and not many:

@@ -16,7 +16,8 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # Adam's usual settings
 
 @dataclass(frozen=True)
 class Batch:
-    """B transitions. After a transition that ended its episode, no reward follows."""
+    """A mini-batch of B transitions. If a transition ended its episode, the value of its next state
+    is 0."""
 
     states: Array  # (B, state)
     actions: Array  # (B,)
@@ -54,10 +55,11 @@ class Trained:
 def critic_update(
     actor: Trained, critics: Trained, batch: Batch, noise: Array, discount: float
 ) -> float:
-    """Fill the critics' gradients with the gradients of their mean squared error; returns the
+    """Fill the critics' gradients with the gradients of their mean squared error. Returns this
     error.
 
-    The target is r + discount min Q'(s', mu'(s') + noise), r after a terminal state; `noise` (B,).
+    The target is r + discount min Q'(s', mu'(s') + noise), or r if the transition ended its
+    episode. `noise` is (B,).
     """
     next_action = np.tanh(forward(actor.target_layers, batch.next_states).out[0])
     next_action = np.clip(next_action + noise, -1.0, 1.0)

@@ -5,8 +5,8 @@ time of an update are overhead. Tests compare the gradients with torch's.
 
 A network is state -> hidden 1 (ReLU) -> hidden 2 (ReLU) -> one number. The critic's action joins
 the output of hidden 1, so that it enters the last hidden layer, as in the paper's figure of the
-networks. N networks of one shape are computed together from parameters (N, P). A row consists of
-W1 (state, h1), b1, W2 (h1 + actions, h2), b2, W3 (h2), b3.
+networks. N networks of one shape are computed together from parameters (N, P). A row of the
+parameters consists of W1 (state, h1), b1, W2 (h1 + actions, h2), b2, W3 (h2), b3.
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 SMALL_OUTPUT = 3e-3
-"""Bound of the output layer's initial weights, so that the first outputs are near 0 (Lillicrap et
-al. 2016, section 7)."""
+"""Bound of the absolute values of the output layer's initial weights. With small weights the first
+outputs are near 0 (Lillicrap et al. 2016, section 7)."""
 
 
 class Shape(NamedTuple):
@@ -29,7 +29,7 @@ class Shape(NamedTuple):
     h1: int
     h2: int
     actions: int = 0
-    """Numbers that join the output of hidden 1: 1 for a critic, 0 for an actor."""
+    """Number of actions that join the output of hidden 1: 1 for a critic, 0 for an actor."""
 
     @property
     def parameters(self) -> int:

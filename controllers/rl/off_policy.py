@@ -1,4 +1,5 @@
-"""DDPG and TD3 with many cars: the same agent and updates as with one car, with larger batches."""
+"""DDPG and TD3 with many cars. The agent and its updates are the same as with one car, except for
+larger mini-batches."""
 
 from dataclasses import replace
 
@@ -11,13 +12,14 @@ from controllers.rl.checkpoint import Tensors
 from controllers.rl.config import EXPLORATION_NOISE, Algorithm, exploration_share
 
 BATCH = 256
-"""Transitions per update. The time per transition is half of the time in a batch of 64."""
+"""Number of transitions per update. The computing time per transition is half of the time per
+transition with 64 transitions per update."""
 STEPS_PER_UPDATE = 8
 """Control steps per update, summed over all cars."""
 
 
 class OffPolicy:
-    """DDPG or TD3 with N cars: `explore` and `learn` are called in turn, once per control step."""
+    """DDPG or TD3 with N cars. In each control step `explore` is called once, then `learn`."""
 
     horizon = 1
 
@@ -33,8 +35,8 @@ class OffPolicy:
         return self._agent.act_all(self._agent.see(states))
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
-        """Return the present actor's actions (N,) with random noise, whose probability falls in the
-        training."""
+        """Return the present actor's actions (N,) for states (N, size). Random noise is added with
+        a probability that falls during the training."""
         agent, count = self._agent, len(states)
         noise = agent.algorithm.beta * EXPLORATION_NOISE * rng.standard_normal(count, np.float32)
         noise *= rng.random(count) < exploration_share(agent.replay.added)

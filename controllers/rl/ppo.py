@@ -5,16 +5,17 @@ standard deviation that does not depend on the state. Advantages are generalised
 (Schulman et al. 2016). Differences from CleanRL's `ppo_continuous_action.py`:
 
 - The hidden layers have ReLU, and the mean action is odd: half the difference between tanh of the
-  network's outputs for the state and for its mirror image. So the actor's files are those of `td3`.
-- An episode that is cut by its number of steps continues with the value of its last state.
+  network's outputs for the state and for its mirror image, as in the actor's files of `td3`.
+- If an episode ends by its number of steps, the value of its last state replaces later rewards.
 - The discount factor of a step depends on the distance driven in it, not on its duration: a slow
   car needs more steps, but not more metres, to return to the middle of the road.
 - Advantages are divided by their typical size in the same state, which the critic's second output
-  learns: at the start, where the car is slow, they are small but cost most of the score. Then they
-  are divided by their mean absolute deviation, not by their standard deviation, and limited to 4
-  times it: an early end costs hundreds of times as much as a usual step, and would hide all others.
+  learns. Without this division the start, where the car is slow and the advantages are small, would
+  have little weight, although most of the score is lost there. Then advantages are divided by their
+  mean absolute deviation, not by their standard deviation, and clipped at 4 times this deviation:
+  an early end costs hundreds of times as much as a usual step, and would outweigh all other steps.
 - The critic also receives the exact state and the road ahead (`privileged`).
-- The standard deviation is at least 0.05.
+- The standard deviation of the steering is at least 0.05.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
   there is no bonus for entropy.
 - Rewards and states are scaled by constants instead of running means.
@@ -42,15 +43,14 @@ from controllers.rl.config import PpoSettings
 
 ADAM_EPSILON = 1e-5
 SIZE_FLOOR, SIZE_WEIGHT = 0.01, 0.1
-"""SIZE_FLOOR is added to the size of an advantage before the logarithm is taken. SIZE_WEIGHT is the
-weight of the logarithm's loss beside the value's loss."""
+"""SIZE_FLOOR is added to the absolute value of an advantage before its logarithm is taken.
+SIZE_WEIGHT is the weight of the loss of this logarithm, relative to the loss of the value."""
 ADVANTAGE_LIMIT = 4.0
 V_X_AT = privileged.PARTS.index("v_x") - privileged.SIZE
-"""Index of v_x of the privileged state, from the end of a state joined with its privileged state.
-"""
+"""Index, counted from the end, of v_x in a state that is followed by its privileged state."""
 LEAST_STD = 0.05
-"""Least standard deviation of the steering actions. Without this limit it falls to 0.02 within 1.5
-million steps, and the score does not improve any more."""
+"""Least standard deviation of the steering actions. Without this limit the standard deviation falls
+to 0.02 within 1.5 million steps, and from then on the score does not improve."""
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -150,7 +150,7 @@ class Rollout:
 
 
 class Ppo:
-    """PPO with N cars: `explore` and `learn` are called in turn, once for each control step."""
+    """PPO with N cars. In each control step `explore` is called once, then `learn`."""
 
     def __init__(
         self,
@@ -184,7 +184,7 @@ class Ppo:
         return means
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
-        """Return random actions (N,) of the policy, which can lie outside [-1, 1]."""
+        """Return random actions (N,) for states (N, size); they can lie outside [-1, 1]."""
         noise = rng.standard_normal(len(states), np.float32)
         return self.act(states) + noise * np.float32(math.exp(self.policy.log_std.item()))
 
@@ -255,7 +255,7 @@ class Ppo:
         }
 
     def _next_values(self, values: Array) -> Array:
-        """Return the values (T, N) of the states after the steps, from the `values` before them."""
+        """Return the values (T, N) of the states after the steps; `values`: before the steps."""
         row = self._rollout
         found = np.empty_like(values)
         found[:-1] = values[1:]
@@ -274,7 +274,8 @@ class Ppo:
         """Train the actor for all epochs; returns the means of its loss and of its KL divergence
         from the policy before the update.
 
-        `targets` (B, 3): the action, the logarithm of its density before the update, its advantage.
+        `orders`: a random order for each epoch. `states` (B, size + 21). `targets` (B, 3): the
+        action, the logarithm of its density before the update, and its advantage.
         """
         policy, found = self.policy, []
         for batch, chosen in self._minibatches(orders, states, targets):
@@ -290,9 +291,10 @@ class Ppo:
         return mean_loss, mean_kl
 
     def _improve_critic(self, orders: list[Tensor], states: Tensor, wanted: Tensor) -> float:
-        """Train the critic for all epochs; returns the mean of the loss of its values.
+        """Train the critic for all epochs; returns the mean loss of its values.
 
-        `wanted` (B, 2): the return, and the logarithm of the size of the advantage.
+        Arguments as for `_improve_actor`, but `wanted` (B, 2): the return, and the logarithm of the
+        absolute value of the advantage.
         """
         losses = []
         for batch, targets in self._minibatches(orders, states, wanted):

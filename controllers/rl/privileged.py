@@ -3,8 +3,8 @@ state.
 
 Only the training needs a critic, so its input can contain more than the actor's (an asymmetric
 actor-critic: Pinto et al. 2018). The actor's state is noisy and late, and does not contain the
-curvature of the road. With the actor's state alone a critic would attribute the effect of a bend to
-the action before it.
+curvature of the road. If the critic received only the actor's state, it would attribute the effect
+of a bend to the action before the bend.
 """
 
 import numpy as np
@@ -35,8 +35,9 @@ PARTS = (
     *(f"curvature_{ahead:g}" for ahead in AHEAD_M),
     *("friction", "mass", "throttle", "delay", "noise"),
 )
-"""Names of the numbers. Throttle is the difference from THROTTLE; friction and mass are relative
-differences from the car's default parameters."""
+"""Names of the numbers of the privileged state. `throttle` is the difference from THROTTLE;
+`friction` and `mass` are relative differences from the car's default parameters. SI units, `delay`
+in control steps."""
 SPREAD = np.array(
     (
         *(0.5, 0.04, 20.0, 0.8, 0.4, 0.3, 5.5),
@@ -60,9 +61,10 @@ def privileged_state(
     """Return the privileged states (N, 21) of the cars of `fleet`: the numbers that `PARTS` names,
     each divided by its typical size.
 
-    The arguments are arrays (N,): `throttle` in [0, 1], `delay` in control steps, and `noise`, the
-    standard deviation of the perception's noise as a share of its largest value; 1 for a car with
-    errors like those on images.
+    The arguments are arrays (N,): `throttle` in [0, 1], `delay` of the perception in control steps,
+    and `noise` in [0, 1], the factor on the standard deviations of the sensor noise
+    (`controllers.drive.disturbance`). For a car with image errors (`cars.IMAGE_ERRORS`) `noise` is
+    1.
     """
     found = np.zeros((len(fleet.cars), SIZE), np.float32)
     cars, _, _, tables, _, _, roads, _, _ = fleet.arrays

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 CONFIG, CURVE, TENSORBOARD = "config.json", "curve.csv", "tensorboard"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 UNCOMPARED = ("out", "threads", "resume")
-"""Options that are not compared when a training continues; the folder `out` may have been moved."""
+"""Options that may differ from the stored options when a training continues. `out` may differ,
+because the folder may have been moved."""
 
 
 def stored_config(run: Path) -> TrainConfig:
@@ -42,8 +43,8 @@ def stored_config(run: Path) -> TrainConfig:
 
 
 def prepare_folder(config: TrainConfig) -> None:
-    """Make the folder of the run, or check that it contains a run of the same configuration; raises
-    UserError otherwise."""
+    """Make the folder of the run. If it contains a run already, raise UserError unless this run has
+    the same configuration."""
     path = config.out / CONFIG
     if not path.exists():
         config.out.mkdir(parents=True, exist_ok=True)
@@ -116,7 +117,7 @@ class RunFolder:
         self.progress.seconds = time.monotonic() - self._started
 
     def add_point(self, values: Mapping[str, float]) -> None:
-        """Add a point to TensorBoard's curves of the training."""
+        """Add a point with the `values` by name to TensorBoard's curves of the training."""
         if self._tensorboard is not None:
             named = {f"train/{name}": value for name, value in values.items()}
             self._tensorboard.add(self.progress.step, named)

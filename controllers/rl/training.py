@@ -39,9 +39,10 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 PAPER_EPISODE_STEPS, RANDOM_EPISODE_STEPS = 6500, 400
-"""Steps of an episode from the paper's start, and with `random_starts`."""
+"""Number of steps of an episode without and with the setting `random_starts`."""
 PAPER_STARTS = 0.1
-"""Share of the episodes that begin at the paper's start with `random_starts`."""
+"""Share of the episodes that begin at the paper's start if `random_starts` is set. All other
+episodes begin at a random position and speed."""
 
 Report = Callable[[int, float], None]
 """A function that is called with the number of finished steps and the best score per step so far,
@@ -52,7 +53,8 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
     """Train as `config` describes, from the checkpoint of the run if it has one; returns the
     figures that `controllers train` prints.
 
-    Writes the best actor (by the evaluations), its curves and `config.json` into `config.out`.
+    Writes the actor with the best evaluation, the curves of the training and `config.json` into
+    `config.out`.
     Raises UserError for an unknown name, or a run of another configuration.
     """
     config = resolve(config)
@@ -146,7 +148,8 @@ class _Training:
         return Observation(now.to_middle, now.angle, heading, now.vx, now.vy, now.yaw_rate)
 
     def _start(self, rng: np.random.Generator) -> dict[str, float]:
-        """Return options of the reset: {} for the paper's start, or a random position and speed."""
+        """Return the options of the environment's reset: {} for the paper's start, else a random
+        position and speed."""
         if not self._algorithm.random_starts or rng.random() < PAPER_STARTS:
             return {}
         return {
@@ -175,7 +178,8 @@ class _Training:
         )
 
     def _actor(self, score: float) -> Actor:
-        """Return the target actor: an average over the last updates, which steers more smoothly."""
+        """Return the target actor. It is an average of the actor over the last updates, and steers
+        more smoothly than the actor itself."""
         agent, algorithm, config = self._agent, self._algorithm, self._config
         assert config.track is not None
         card = ActorCard(

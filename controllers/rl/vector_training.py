@@ -184,8 +184,8 @@ class _Training:
                 self._report(min(progress.step, self._steps), progress.best_score)
 
     def _evaluate(self) -> tuple[float, float, float]:
-        """Make a drive without noise on each track; returns the reward per step, the mean offset
-        (m) and the largest offset (m).
+        """Make a drive without noise on each track. Returns the mean reward per step over all
+        drives, and the mean and the largest absolute offset (m) in the driven steps.
 
         As in `controllers drive`, each step after an early end counts 0, or OFF_TRACK_REWARD with
         the quadratic reward.
