@@ -3,7 +3,7 @@
 Run: `python benchmarks/calibration.py [--films 10] [--seconds 60] [--keep FOLDER] [--json FILE]`.
 Claim: pitch and yaw are within 0.3 degrees and the height is within 5 % for ten random mounts, on
 roads with curves and hills and with known lane width. The films have 10 frames per second, because
-the calibration reads no more frames of a faster film (`mtlnet.calibration.film.SAMPLE_S`). If the
+the calibration reads at most 10 frames per second (`mtlnet.calibration.film.SAMPLE_S`). If the
 folder `../shared/real_roads` exists, the pitch found from the pictures of one real drive is also
 compared with the horizon in the labels of these pictures (limit 0.5 degrees).
 """
@@ -82,7 +82,8 @@ def random_mount(seed: int) -> Mount:
 
 
 def render_film(mount: Mount, path: Path, seconds: float, seed: int) -> None:
-    """Write a film of `seconds` of the scripted driver's drive, seen by the camera of `mount`."""
+    """Write a film of `seconds` s of a drive of the scripted driver to `path`. The camera and the
+    road are described by `mount`; `seed` determines the drive."""
     road = Road(find_track(mount.track), mount.lanes, mount.lane_width_m)
     course = make_course("lane", road, 25.0 * seconds, np.random.default_rng([seed, 36]))
     driver = ScriptedDriver(road, course, mount.speed_kmh / 3.6, FPS * 2)
@@ -109,7 +110,8 @@ def render_film(mount: Mount, path: Path, seconds: float, seed: int) -> None:
 
 
 def _euler(turn: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Roll, pitch and yaw (rad) of a rotation matrix (3, 3): the inverse of `rotation`."""
+    """Return roll, pitch and yaw (rad) of a camera with the rotation matrix `turn` (3, 3): the
+    inverse of `CameraParameters.rotation`."""
     return (
         float(np.arctan2(turn[2, 1], turn[2, 2])),
         float(-np.arcsin(turn[2, 0])),
@@ -118,9 +120,10 @@ def _euler(turn: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def errors(mount: Mount, path: Path) -> dict[str, float]:
-    """Signed errors of the calibration of the film at `path`, and its standard deviations.
+    """Return the signed errors of the calibration of the film at `path` (calibrated minus true
+    mount), and the standard deviations that the calibration estimates.
 
-    Angles in degrees; the height is relative to the true height.
+    Angles are in degrees; errors of the height are relative to the true height.
     """
 
     def lens(size: tuple[int, int]) -> KnownLens:
@@ -142,9 +145,10 @@ def errors(mount: Mount, path: Path) -> dict[str, float]:
 
 
 def real_pitch(folder: Path) -> dict[str, float] | None:
-    """Calibrated pitch of the pictures of REAL_DRIVE, and the pitch by the horizon of their labels.
+    """Return the pitch that is calibrated from the pictures of REAL_DRIVE, and the pitch that
+    follows from the horizon in the labels of these pictures.
 
-    Returns None if `folder` has no labels.csv.
+    The result is None if `folder` has no labels.csv.
     """
     if not (folder / "labels.csv").is_file():
         return None

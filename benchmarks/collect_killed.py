@@ -3,13 +3,13 @@
 Run: `python benchmarks/collect_killed.py [--kills 200] [--rounds 8] [--frames 20] [--seed 1]
 [--json FILE]`. A run of `datagen collect` is killed (SIGKILL for all its processes) at a random
 moment and started again, until the dataset is complete. This is repeated with new folders until
-the number of kills is reached. Claim: every round that was finished at a kill has the same bytes
-and modification time at the end, and every dataset has the hash of an undisturbed run.
+the number of kills is reached. Claim: every round that was finished before a kill still has the
+same bytes and modification time at the end, and every dataset has the hash of an undisturbed run.
 
-A third of the kills come at a random time of the run; most of this time is start-up. The other
-kills come within a short random time after a change in the folder: a round is begun, is renamed,
-gets its state file, or was the last round. `phases` in the result counts the states in which the
-kills left the folder.
+A third of the kills come at a random time of the run; most of a run is start-up. All other kills
+come within a short random time after a change in the folder: a round is begun, a round is renamed,
+a round gets its state file, or the last round is finished. `phases` in the result counts the states
+in which the kills left the folder.
 """
 
 import hashlib
@@ -39,7 +39,7 @@ LONGEST_PART = 1.3
 POLL_S = 0.001
 
 Finished = dict[str, tuple[str, int]]  # round -> (SHA-256, modification time in ns)
-Occurred = Callable[[Path], int]  # how often an event has occurred in the folder so far
+Occurred = Callable[[Path], int]  # returns how often an event has occurred in a folder so far
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,8 @@ EVENTS = {
 
 @dataclass(frozen=True)
 class Moment:
-    """When to kill: `seconds` after the start, or after `event` has occurred `times`."""
+    """The moment of a kill: `seconds` after the start of the collection or, if `event` is given,
+    `seconds` after the event has occurred `times` times."""
 
     seconds: float
     event: Event | None = None
@@ -102,9 +103,11 @@ def collect(out: Path, options: tuple[str, ...]) -> float:
 
 
 def collect_until(out: Path, options: tuple[str, ...], moment: Moment) -> str:
-    """Collect and kill all processes at `moment`; return the phase in which they were killed.
+    """Collect into `out` and kill all processes at `moment`. Return the phase in which they were
+    killed.
 
-    Returns "" if the collection ended before. Raises RuntimeError if it failed by itself.
+    Returns "" if the collection ended before `moment`. Raises RuntimeError if the collection ended
+    with an error.
     """
     process = subprocess.Popen(
         command(out, options),
@@ -136,7 +139,8 @@ def await_event(process: subprocess.Popen[bytes], out: Path, event: Event, times
 
 
 def phase(out: Path) -> str:
-    """The phase in which a collection was killed, derived from the files in its folder."""
+    """Return the phase in which a collection was killed, derived from the files in its folder
+    `out`."""
     if not (out / "plan.json").is_file():
         return "planning"
     partial = [file.stat().st_size for file in out.glob(".partial/*/round.mcap")]
@@ -157,7 +161,8 @@ def _number(out: Path, pattern: str) -> int:
 
 
 def finished(out: Path) -> Finished:
-    """SHA-256 and modification time (ns) of every round that has a state file."""
+    """Return the SHA-256 and the modification time (ns) of every finished round in `out`, by the
+    round's name. A finished round has a state file."""
     found = {}
     for state in out.glob("state/*.json"):
         path = out / "rounds" / f"{state.stem}.mcap"
@@ -167,7 +172,8 @@ def finished(out: Path) -> Finished:
 
 
 def content_hash(out: Path) -> tuple[str, bool]:
-    """The dataset's content hash, and whether `datagen verify --level full` finds no problem."""
+    """Return the content hash of the dataset in `out`, and whether `datagen verify --level full`
+    finds no problem in it."""
     done = subprocess.run(
         [sys.executable, "-m", "datagen", "verify", str(out), "--level", "full", "--json"],
         capture_output=True,

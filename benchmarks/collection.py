@@ -4,9 +4,10 @@ Run: `python benchmarks/collection.py [--rounds 60] [--frames 2000] [--out FOLDE
 If FOLDER is given, the dataset stays in `FOLDER/data`. Claim (two cores, Mesa, 280 x 210 px): at
 least 250 frames per second, including physics, rendering, labels, JPEG, MCAP and checks, and at
 least 0.75 of the frames per second of rendering alone. Rendering alone draws the same frames with
-the same traffic; its scenes are built before its time is measured. The result has the ratios of
-wall time, which the claim concerns, and of processor time, which depends less on other jobs. With
-fewer than the default 60 rounds, start-up and the end, when a core is idle, have too much weight.
+the same traffic; its scenes are built before its time is measured. The result has the ratios of the
+two wall times, which the claim concerns, and of the two processor times, which depend less on other
+jobs. With fewer than the default 60 rounds the start-up and the end of a collection, when a core is
+idle, would have too much weight.
 """
 
 import contextlib
@@ -32,7 +33,7 @@ FRAMES_OF_WARM_UP = 20
 
 
 def collect_timed(out: Path, rounds: int, frames: int, seed: int) -> dict[str, Any]:
-    """Run `datagen collect`; return its result and, as `cpu_s`, the processor time in s."""
+    """Run `datagen collect`; return its JSON result with the processor time in s as `cpu_s`."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     # stretch=1: every frame has another scenery, as in a training set.
     found = collect(out, rounds=rounds, frames=frames, seed=seed, stretch=1)
@@ -42,9 +43,9 @@ def collect_timed(out: Path, rounds: int, frames: int, seed: int) -> dict[str, A
 
 
 def draw_round(entry: dict[str, Any]) -> tuple[int, float, float]:
-    """Simulate and render a round of the plan.
+    """Simulate and render the round `entry` of the dataset's plan.
 
-    Returns the number of frames, and wall time and processor time of rendering in s.
+    Returns the number of frames, and the wall time and the processor time of the rendering in s.
     """
     # One thread per process for Mesa and numpy, as in the collector's workers.
     os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1")

@@ -1,14 +1,14 @@
 """Processor time of the public benchmark of controllers.
 
-For each controller it has 805 drives: 10 tracks of the project and 13 of TORCS, each without a
-disturbance and with each of six disturbances, with five seeds.
+For each controller the public benchmark has 805 drives: on 10 tracks of the project and 13 tracks
+of TORCS, without a disturbance and with each of six disturbances, each with five seeds.
 
 Run: `python benchmarks/compare_many.py [--controllers lqr,mpc] [--share 1] [--json FILE]`. It takes
 some minutes per controller on two cores, and needs TORCS's tracks (`TORCS_TRACKS`). Each controller
-drives all tracks at once, as in `controllers compare --disturb --seeds 5`, for the share `--share`
-of the steps of each drive; the times are extrapolated to all steps. One drive is also timed alone
-and must give the same result. Claim: at most 6 minutes of processor time per controller, which is 3
-minutes on two cores.
+makes all drives at the same time, as in `controllers compare --disturb --seeds 5`. `--share` is the
+share of the steps of each drive that is driven; the times are extrapolated to all steps. One drive
+is also made and timed alone, and must give the same result. Claim: at most 6 minutes of processor
+time per controller, which is 3 minutes on two cores.
 """
 
 import os
@@ -33,7 +33,8 @@ LIMIT_S = 360.0
 
 
 def tasks_of(controller: str, share: float) -> tuple[list[Task], int]:
-    """The benchmark's drives, each with a `share` of its steps; and the sum of all their steps."""
+    """Return the drives of the benchmark, each with a `share` of its steps, and the number of steps
+    of all drives without this reduction."""
     tasks, whole = [], 0
     for track in list_tracks():
         steps = steps_for(None, track.name, track.length_m)
@@ -52,9 +53,11 @@ def tasks_of(controller: str, share: float) -> tuple[list[Task], int]:
 
 
 def measure(controller: str, share: float) -> dict[str, float | bool]:
-    """Make all drives of a controller at once and one drive alone; return the processor times.
+    """Make all drives of a controller at the same time, then one drive alone. Return the processor
+    times, and whether both gave the same result for this drive.
 
-    The times are in s for the whole benchmark (extrapolated) and in us per step.
+    The times are in s (for the driven steps, and extrapolated to the whole benchmark) and in us per
+    step.
     """
     tasks, whole = tasks_of(controller, share)
     for _ in drive_many(tasks[:1]):  # compiles the code before the time is measured

@@ -2,9 +2,10 @@
 
 Run: `python benchmarks/controller_time.py [--track town] [--steps 3000] [--model RUN]
 [--json FILE]`. Each controller drives the track, and only its `update` is timed. Then `lqr` drives
-on the answers of the service, which runs in another process. Here the whole step is timed:
-rendering, HTTP request and controller. Limits: MPC median 0.3 ms and p99 1 ms, LQR and RL p99 0.1
-ms, a step with images p99 25 ms. The exit code is 1 if a limit is missed.
+on the answers of the service, which runs in another process. In this drive the whole control step
+is timed: rendering, HTTP request and controller. Limits: for MPC a median of 0.3 ms and a p99 of 1
+ms, for LQR and RL a p99 of 0.1 ms, for a control step with images a p99 of 25 ms. The exit code is
+1 if a time is above its limit.
 """
 
 import sys
@@ -39,7 +40,7 @@ P99_MS = {
     "mpc-preview": 1.0,
 }
 IMAGES, IMAGES_P99_MS = "lqr on images", 25.0
-WARM_UP = 20  # steps on images that are driven first and not counted
+WARM_UP = 20  # control steps with images that are driven first and not timed
 
 
 class Timed:

@@ -6,13 +6,13 @@ Eight clients send 20 requests per second each. The workers are replaced every f
 model is reloaded every minute, alternately from two runs. Claims: no admitted request is lost
 (every request is answered or refused, and the clients receive as many answers as the service
 counts), and no answer is wrong. An answer is right if it is bit-equal to the prediction of the
-model that it names, and that model was loaded at some moment between request and answer.
+model that it names, and if this model was loaded at some moment between request and answer.
 
 With `--attacks` there are no restarts and no reloads. Malicious clients make all attacks of the
 tests once per minute (for two hours: --minutes 120). Claims: no request is lost, no answer is
-wrong, the memory of the service in the last minute is at most 1 % above that in the first minute,
-and the p99 after the first minute is at most 1.2 times the p99 in it. The first minute begins after
-a minute of warm-up.
+wrong, the memory of the service in the last minute is at most 1 % above its memory in the first
+minute, and the p99 of the answers after the first minute is at most 1.2 times the p99 in the first
+minute. The first minute begins after a minute of warm-up.
 """
 
 import os
@@ -53,7 +53,7 @@ IMAGES = 16
 GROWTH, SLOWER = 0.01, 1.2
 MINUTE_S = 60.0
 PART_S = 10 * MINUTE_S
-"""A long run is also reported in parts of this length."""
+"""The figures of a long run are also reported for parts of this length (s)."""
 COUNTED = re.compile(r'^driverview_frames_total\{.*outcome="answered".*\} ([0-9.e+]+)$', re.M)
 
 ExpectedAnswers = dict[str, list[dict[str, Any]]]  # model hash -> its answers to the images
@@ -61,16 +61,15 @@ ExpectedAnswers = dict[str, list[dict[str, Any]]]  # model hash -> its answers t
 
 @dataclass
 class ModelHistory:
-    """The models that were loaded: hash of the first one, and (begin, end, hash) of each reload.
-
-    Times are of `time.monotonic()` in s.
-    """
+    """The models that were loaded: the hash of the first model, and (begin, end, hash of the new
+    model) of each reload. Times are in s, by `time.monotonic()`."""
 
     first: str
     reloads: list[tuple[float, float, str]] = field(default_factory=list)
 
     def allowed(self, sent: float, received: float) -> set[str]:
-        """The models that were loaded at some moment between `sent` and `received` (s)."""
+        """Return the hashes of the models that were loaded at some moment between the times `sent`
+        and `received` (s)."""
         model, models = self.first, set()
         since = -1.0
         for begin, end, next_model in [*self.reloads, (float("inf"), float("inf"), "")]:
@@ -82,11 +81,12 @@ class ModelHistory:
 
 @dataclass
 class ClientLog:
-    """What one client received.
+    """The answers that one client received.
 
     An entry of `answers` has the times of request and answer (s), the hash of the model, and
     whether the answer is bit-equal to the model's prediction. Whole answers are not kept, because
-    those of two hours would take gigabytes. `missed` counts requests that were not sent in time.
+    the answers of two hours would take gigabytes. `missed` counts requests that were left out,
+    because they could not be sent in time.
     """
 
     answers: list[tuple[float, float, str, bool]] = field(default_factory=list)
@@ -105,7 +105,8 @@ def send_requests(
 ) -> None:
     """Send requests at 20 Hz until `end` (s, monotonic) and write the answers to `log`.
 
-    Client `number` starts `number` / CLIENTS of a period later, so that not all send at once.
+    Client `number` starts later by the share `number` / CLIENTS of a period, so that the clients do
+    not all send at the same time.
     """
     begin = time.monotonic() + number / CLIENTS / HERTZ
     with Client(f"127.0.0.1:{port}", timeout_s=10.0) as client:
@@ -134,10 +135,8 @@ def send_requests(
 def clients(
     port: int, images: list[bytes], expected: ExpectedAnswers, end: float, logs: list[ClientLog]
 ) -> Iterator[None]:
-    """Run a client for each log until `end`. On exit, wait for the clients and raise their errors.
-
-    `end`: s, monotonic.
-    """
+    """Run a client for each log until `end` (s, monotonic). When the context ends, wait for the
+    clients and raise their errors."""
     with ThreadPoolExecutor(len(logs)) as pool:
         running_clients = [
             pool.submit(send_requests, port, number, images, expected, end, log)
@@ -153,7 +152,7 @@ def reload_and_restart(
 ) -> Counter[str]:
     """Reload the model every minute and restart the workers every five minutes until `end`.
 
-    Returns how often each was done.
+    Returns the numbers of reloads and of restarts.
     """
     done: Counter[str] = Counter()
     begin = time.monotonic()
@@ -177,7 +176,8 @@ def _reload(port: int, run: Path, history: ModelHistory) -> None:
 
 
 def expected_answers(run: Path, images: list[bytes]) -> list[dict[str, Any]]:
-    """Answers (JSON) of the model in the folder `run` to the images, computed in this process."""
+    """Return the answers (JSON) of the model in the folder `run` to the images. They are computed
+    in this process."""
     engine = load_engine(run)
     camera = engine.card.camera
     return [
@@ -197,7 +197,8 @@ def is_correct(answer: dict[str, Any], which: int, expected: ExpectedAnswers) ->
 
 
 def wrong_answers(log: ClientLog, history: ModelHistory) -> list[str]:
-    """A message for each answer whose model was not loaded, or that differs from its prediction."""
+    """Return a message for each answer whose model was not loaded at the time, or that differs from
+    the prediction of its model."""
     found = []
     for sent, received, model, correct in log.answers:
         if model not in history.allowed(sent, received):
@@ -245,7 +246,7 @@ def measure(minutes: float, folder: Path) -> dict[str, Any]:
 
 @dataclass
 class Memory:
-    """Samples (time in s, MB) of the resident memory of some processes, in all.
+    """Samples (time in s, MB) of the resident memory of the processes `pids`, summed over them.
 
     `fault` is a message if one of the processes has ended.
     """
@@ -296,7 +297,8 @@ def measure_attacked(minutes: float, folder: Path) -> dict[str, Any]:
 def attacked_figures(
     logs: list[ClientLog], memory: Memory, history: ModelHistory, begin: float, end: float
 ) -> dict[str, Any]:
-    """The figures from `begin` to `end` (s, monotonic), and whether the claims are reached."""
+    """Return the figures of the time from `begin` to `end` (s, monotonic), and whether the claims
+    are reached."""
     faults = [fault for log in logs for fault in [*log.lost, *wrong_answers(log, history)]]
     faults += [memory.fault] if memory.fault else []
     answers = [(sent, 1e3 * (done - sent)) for log in logs for sent, done, _, _ in log.answers]

@@ -32,7 +32,7 @@ from mtlnet.sources.read import SourceImage
 
 CLAIM_FPS = 45.0
 CORES = 2
-KEPT = 60  # pictures with which the parts after decoding are timed
+KEPT = 60  # number of pictures with which the parts after decoding are timed
 
 
 def make_film(path: Path, seconds: float) -> bool:
@@ -49,14 +49,16 @@ def make_film(path: Path, seconds: float) -> bool:
 
 
 def cpu_ms(work: Callable[[], int]) -> float:
-    """CPU time of `work` in ms per picture; `work` returns the number of its pictures."""
+    """Return the processor time of `work` in ms per picture. `work` processes some pictures and
+    returns their number."""
     begin = process_time()
     count = work()
     return 1e3 * (process_time() - begin) / count
 
 
 def parts(film: Path, model: str, folder: Path) -> dict[str, float]:
-    """CPU time in ms per picture of each part: decode, scale, network, draw and encode."""
+    """Return the processor time in ms per picture of each part of the work: decode, scale, network,
+    draw and encode."""
     engine = load_engine(resolve_run(model))
     camera = engine.card.camera
     pictures: list[Picture] = []

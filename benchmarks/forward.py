@@ -9,7 +9,8 @@ All variants compute the network's nine outputs. If the model has an uncertainty
 `with uncertainty` compute all outputs that `serve` needs.
 
     python benchmarks/forward.py [--model RUN] [--rounds 200] [--out FILE]
-    claims: bf16 at most 0.40 of torch's time, int8 at most 0.20; with uncertainty 0.40 and 0.25
+    claims: bf16 takes at most 0.40 of torch's time and int8 at most 0.20 of it; with uncertainty
+    bf16 takes at most 0.40 of torch's time and int8 at most 0.25 of it
 """
 
 import os
@@ -20,7 +21,7 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
-# numpy and torch read it when they are imported.
+# numpy and torch read this variable when they are imported.
 os.environ["OMP_NUM_THREADS"] = "1"
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -48,7 +49,7 @@ Forward = Callable[[NDArray[np.uint8]], Any]
 
 
 def torch_pass(run: Path) -> Forward:
-    """A function that runs the torch network in float32, channels-last, on one thread."""
+    """Return a function that runs the torch network in float32, channels-last, on one thread."""
     torch.set_num_threads(1)
     network = load_network(run / WEIGHTS, read_card(run).network)
     network.to(memory_format=torch.channels_last)
@@ -63,9 +64,10 @@ def torch_pass(run: Path) -> Forward:
 def openvino_pass(
     run: Path, images: NDArray[np.uint8] | None, *, uncertainty: bool = False
 ) -> Forward:
-    """A function that runs the OpenVINO graph on one thread.
+    """Return a function that runs the OpenVINO graph of the model in `run` on one thread.
 
-    The graph is in bf16, or in int8 if `images` (N, H, W, 3) are given to calibrate it.
+    The graph is in bf16, or in int8 if `images` (N, H, W, 3) are given to calibrate it. With
+    `uncertainty` it computes all outputs that `serve` needs.
     """
     if uncertainty:
         graph = read_graph(run, read_card(run))
@@ -84,7 +86,8 @@ def openvino_pass(
 
 
 def measure(run: Path, rounds: int) -> dict[str, Any]:
-    """Median times in ms, their ratios to torch, and whether the claims hold."""
+    """Return the median times in ms over `rounds` passes of each variant, their ratios to torch's
+    time, and whether the claims hold."""
     rng = np.random.default_rng(0)
     camera = read_card(run).camera
     images = rng.integers(0, 256, (16, camera.height, camera.width, 3), np.uint8)

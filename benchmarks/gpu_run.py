@@ -10,7 +10,8 @@ a deadline, and the next stages also run after a stage that failed or was stoppe
 the results are written to `--out`: `gpu_run.json`, `curves*.csv` and `model/` (weights in float16
 and card). The same command continues a stopped run if the folder `--work` still exists.
 
-`--rehearse` runs everything on a CPU with a few frames and steps; its figures mean nothing.
+`--rehearse` runs all stages on a CPU with a few frames and steps, as a test; its figures mean
+nothing.
 Exit codes: 0 if all stages are done, 1 if some are not, 3 if something is missing.
 """
 
@@ -83,7 +84,8 @@ def parse() -> argparse.Namespace:
 
 
 def commit() -> str:
-    """Hash of this checkout's commit; empty if git is missing or this is no git repository."""
+    """Return the hash of this checkout's commit, or "" if git is missing or this is no git
+    repository."""
     command = ["git", "rev-parse", "HEAD"]
     try:
         done = subprocess.run(command, cwd=wheels.ROOT, capture_output=True, text=True, check=False)

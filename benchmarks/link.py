@@ -4,8 +4,8 @@ Run: `python benchmarks/link.py [--messages 1000000] [--patience 600] [--kills 2
 [--json FILE]`. `--patience` is the time limit in s for the messages of each direction. `--flood`
 and `--echo` are for internal use. Limits: of 10^6 messages in each direction, read while the writer
 writes at full speed, none is torn; in 200 trials in which one side is killed (SIGKILL) at a random
-moment, the other side notices it within 2 s and no segment remains. As a control, a reader without
-the sequence lock must see torn messages. Needs gcc.
+moment, the other side notices the kill within 2 s and no segment remains. As a control, a reader
+without the sequence lock must see torn messages. The benchmark needs gcc.
 """
 
 import os
@@ -43,7 +43,8 @@ from simulator.world.world import World
 
 
 class Echo:
-    """A simulation that only counts steps, so that the time of the link alone is measured."""
+    """A simulation for the link that only counts steps, so that the time of the link alone is
+    measured."""
 
     episodes, steps, refused, running, position_text = 0, 0, 0, False, ""
 
@@ -108,7 +109,8 @@ def steps_here(world: World, steps: int) -> list[float]:
 
 
 def speed(hammer: str, steps: int) -> dict[str, Any]:
-    """Times in us of a step in this process and over the link, with clients in Python and C.
+    """Return the times in us of a step in this process and over the link, with clients in Python
+    and C.
 
     The variants take turns, so that other load on the machine affects all of them alike.
     """
@@ -135,7 +137,8 @@ def speed(hammer: str, steps: int) -> dict[str, Any]:
 
 
 def missed(result: dict[str, Any], messages: int) -> list[str]:
-    """A message for each limit that `result` misses; the messages are also printed on stderr."""
+    """Return a message for each limit that `result` misses, and print the messages on stderr.
+    `messages` is the number of messages in each direction."""
     found = []
     for way in ("server_to_client", "client_to_server"):
         if way in result:

@@ -1,13 +1,14 @@
 """Images per second read from shuffled rounds into uint8 batches, and time to open a dataset.
 
 Run: `python benchmarks/loader.py [--data DIR] [--json FILE]`. Claims, on two cores with the files
-in the page cache: at least 6,500 images per second, at least twice as many as a torch DataLoader
-with two workers on the same files, and five times as many as the `mcap` reader, which reads one
-image at a time; 60 rounds are opened in at most 150 ms.
+in the page cache: the training loader reads at least 6,500 images per second, at least twice as
+many as a torch DataLoader with two workers on the same files, and at least five times as many as
+the `mcap` reader, which reads one image at a time; 60 rounds are opened in at most 150 ms.
 
-`decoder` is simplejpeg alone, one thread per core: the upper limit. `ours` is the training loader.
-`dataloader` is a typical user's loader: `simplejpeg` for each item, default collation, shuffled,
-two persistent workers. It uses our index; with the official reader it would be far slower.
+`decoder` in the result is simplejpeg alone, with one thread per core: the upper limit. `ours` is
+the training loader. `dataloader` is the loader of a typical user: `simplejpeg` for each item,
+default collation, shuffled, two persistent workers. It finds the images by the index of this
+project; with the official `mcap` reader it would be far slower.
 """
 
 import os
@@ -99,7 +100,8 @@ def dataloader(frames: Frames, batches: int) -> Read:
 
 
 def mcap_reader(frames: Frames, order: NDArray[np.int64], count: int) -> Read:
-    """A `Read` of `count` images, each with the official library: seek, read, decode."""
+    """Return a `Read` of `count` images. The official `mcap` library seeks and reads each image,
+    which is then decoded."""
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from mcap.reader import make_reader
 

@@ -1,4 +1,5 @@
-"""The service under five times the load that it can answer, and with 1,000 slow connections.
+"""Measures the service under five times the load that it can answer, and with 1,000 slow
+connections.
 
 One worker runs on one core and a compiled load generator on another core. The loads are: one client
 alone; as many clients as keep the engine busy (the peak); frames at five times the peak rate, sent
@@ -38,15 +39,16 @@ from runtime.options import options_of
 from serve.config import Limits
 
 OVER, GOODPUT, REFUSED_MS, SLOWER = 5.0, 0.95, 5.0, 2.0
-BUSY = 4  # clients that keep one worker busy; its queue has room for their frames
-CONNECTIONS = 64  # of the load generator under overload
-SLOW = 1000  # slow connections
-SETTLE_S = 3.0  # for the slow connections to open
-SERVER, CLIENTS = {0}, {1}  # cores
+BUSY = 4  # number of clients that keep one worker busy; its queue has room for their frames
+CONNECTIONS = 64  # number of connections of the load generator under overload
+SLOW = 1000  # number of slow connections
+SETTLE_S = 3.0  # time in which the slow connections are opened
+SERVER, CLIENTS = {0}, {1}  # cores of the service and of its clients
 
 
 def overload(loader: Loader, port: int, seconds: float) -> dict[str, Any]:
-    """Load the service for `seconds` each with one client, at its peak, and at five times that."""
+    """Load the service with one client, at its peak rate, and at five times its peak rate, each for
+    `seconds`. Return the rates per second and the times in ms."""
     loader.run(port, 1, 1.0)
     alone = loader.run(port, 1, seconds)
     peak = loader.run(port, BUSY, seconds).per_second()
@@ -66,8 +68,9 @@ def overload(loader: Loader, port: int, seconds: float) -> dict[str, Any]:
 
 
 def beside_slow_ones(loader: Loader, port: int, seconds: float, rate: float) -> dict[str, Any]:
-    """Load the service with four clients at `rate` requests per second, in all; then again together
-    with slow connections. Return both p99 and the requests that were not answered."""
+    """Load the service for `seconds` with four clients that together send `rate` requests per
+    second, without slow connections and then with them. Return both p99 in ms, and the number of
+    requests that were not answered while there were slow connections."""
     before = loader.run(port, BUSY, seconds, rate)
     with crowd(port):
         beside = loader.run(port, BUSY, seconds, rate)
@@ -80,7 +83,7 @@ def beside_slow_ones(loader: Loader, port: int, seconds: float, rate: float) -> 
 
 @contextmanager
 def crowd(port: int) -> Iterator[None]:
-    """Hold SLOW slow connections to the service open while the context lasts."""
+    """Hold SLOW slow connections to the service at `port` open while the context lasts."""
     process = subprocess.Popen(
         [sys.executable, str(HERE / "slow_clients.py"), str(port), str(SLOW)],
         preexec_fn=lambda: os.sched_setaffinity(0, CLIENTS),
@@ -94,7 +97,7 @@ def crowd(port: int) -> Iterator[None]:
 
 
 def judge(found: dict[str, Any]) -> dict[str, bool]:
-    """Whether each claim holds for the figures of our service."""
+    """Return for each claim, by name, whether it holds for `found`, the figures of our service."""
     queue_ms = Limits().queue * 1e3 / found["peak_per_second"]
     return {
         "admitted": found["admitted_p99_ms"] <= 2 * found["alone_p99_ms"] + queue_ms,

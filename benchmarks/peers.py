@@ -10,8 +10,8 @@ environment with the peer, openvino, numpy and simplejpeg. A peer that is not gi
 
     python benchmarks/peers.py --litserve PYTHON --bentoml PYTHON --mosec PYTHON
         [--model RUN] [--int8] [--requests 2000] [--seconds 10] [--turns 3] [--out FILE]
-    claims: our p50 is at most 0.75 (LitServe), 0.65 (BentoML), 1.0 (mosec) of the peer's; our
-    throughput is at least 1.5, 1.8, 1.0 times the peer's
+    claims: our p50 is at most 0.75 (LitServe), 0.65 (BentoML), 1.0 (mosec) of the peer's p50; our
+    throughput is at least 1.5 (LitServe), 1.8 (BentoML), 1.0 (mosec) times the peer's throughput
 """
 
 import sys
@@ -38,12 +38,14 @@ from benchmarks.service_load.servers import (
 from runtime.options import options_of
 
 CLAIMS = {"litserve": (0.75, 1.5), "bentoml": (0.65, 1.8), "mosec": (1.0, 1.0)}
-"""For each peer: our p50 over its p50, at most; our throughput over its throughput, at least."""
+"""For each peer the upper limit of our p50 divided by the peer's p50, and the lower limit of our
+throughput divided by the peer's throughput."""
 CLIENTS, WORKERS = 8, 2
 
 
 def latency(servers: dict[str, Path], run: Path, requests: int) -> dict[str, list[float]]:
-    """Times in ms of `requests` requests to each server, sent in turns of TURN requests."""
+    """Return the times in ms of `requests` requests to each server. The servers get TURN requests
+    each in turns. `servers` has the Python interpreter of each server, `run` the model."""
     found: dict[str, list[float]] = {name: [] for name in servers}
     with ExitStack() as stack:
         ports = {
@@ -57,7 +59,8 @@ def latency(servers: dict[str, Path], run: Path, requests: int) -> dict[str, lis
 
 
 def ask(port: int, count: int) -> list[float]:
-    """Send `count` requests over a new connection, after one that is not counted; times in ms."""
+    """Send `count` requests over a new connection, after one request that is not counted. Return
+    their times in ms."""
     sent, times = request(), []
     with connect(("127.0.0.1", port)) as connection:
         exchange(connection, sent)
@@ -69,7 +72,8 @@ def ask(port: int, count: int) -> list[float]:
 
 
 def throughput(servers: dict[str, Path], run: Path, seconds: float, turns: int) -> dict[str, Any]:
-    """Answers per second of each server and the p99 of their times in ms: medians of the turns."""
+    """Return the answers per second of each server and the p99 of their times in ms. Each figure is
+    the median over the turns; a turn takes `seconds`."""
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in servers}
     with tempfile.TemporaryDirectory() as folder:
         loader = Loader(Path(folder))
@@ -86,7 +90,8 @@ def throughput(servers: dict[str, Path], run: Path, seconds: float, turns: int) 
 
 
 def compare(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
-    """Our p50 and throughput divided by the peer's, the limits, and whether they are kept."""
+    """Return our p50 and throughput divided by the p50 and throughput of the peer `name`, the
+    limits of both ratios, and whether the limits are kept."""
     p50, rate = ours["p50_ms"] / theirs["p50_ms"], ours["per_second"] / theirs["per_second"]
     slowest, fewest = CLAIMS[name]
     held = p50 <= slowest and rate >= fewest

@@ -1,7 +1,9 @@
-"""Compares a dataset that two Ray workers record on one host with that of one process.
+"""Compares a dataset that two Ray workers record on one host with a dataset that one process
+records.
 
 Run: `python benchmarks/ray_hash.py [--rounds 6] [--frames 200] [--json FILE]`. Claim: the hashes of
-the datasets and the bytes of every round are equal. The result also has the time of both in s.
+the datasets and the bytes of every round are equal. The result also has the time of both recordings
+in s.
 """
 
 import sys

@@ -1,4 +1,5 @@
-"""Images per second on one core: camera alone, image environment, and Gymnasium's CarRacing-v3.
+"""Measures images per second on one core: the camera alone, the image environment, and Gymnasium's
+CarRacing-v3.
 
 Run: `python benchmarks/renderer.py [--json FILE]`; it takes about three minutes. Claim, on one core
 with Mesa's llvmpipe: at least 150 complete steps per second of `driverview/DriverView-v0` with an
@@ -17,7 +18,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-# Mesa reads this when the first context is made; with 0 it draws in the calling thread.
+# Mesa reads LP_NUM_THREADS when the first context is made; with 0 it draws in the calling thread.
 os.environ.update(LP_NUM_THREADS="0", OMP_NUM_THREADS="1", SDL_VIDEODRIVER="dummy")
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -49,7 +50,7 @@ CARS_AHEAD_M = (9.0, 16.0, 26.0, 38.0, 55.0, 80.0)
 TURNS, FRAMES = 5, 60
 
 Job = Callable[[int], float]
-"""Draws the given number of frames; returns the seconds they took."""
+"""A function that draws the given number of frames and returns the time in s that this took."""
 
 
 def clock() -> float:
@@ -58,9 +59,9 @@ def clock() -> float:
 
 
 def camera_job(camera: Camera, views: tuple[str, ...] = ("front",), cars: int = 0) -> Job:
-    """A Job that renders `views` from FRAMES positions along the road of `camera`.
+    """Return a Job that renders `views` from FRAMES positions along the road of `camera`.
 
-    `cars` cars stand ahead of each position.
+    `cars` is the number of cars that stand ahead of each position.
     """
     road = camera.road
     places = np.linspace(0.0, road.track.length_m, FRAMES, endpoint=False)
@@ -83,12 +84,13 @@ def camera_job(camera: Camera, views: tuple[str, ...] = ("front",), cars: int = 
 
 
 def environment_job(env: gym.Env[Any, Any]) -> Job:
-    """A Job that steps an environment of this project; the true state determines the steering."""
+    """Return a Job that steps an environment of this project. The steering is computed from the
+    true state."""
     return _stepping(env, lambda info: _steering(info))
 
 
 def car_racing_job() -> Job:
-    """A Job that steps CarRacing-v3, which draws a picture of 96 x 96 px in each step."""
+    """Return a Job that steps CarRacing-v3, which draws a picture of 96 x 96 px in each step."""
     return _stepping(
         gym.make("CarRacing-v3"), lambda info: np.array([0.0, 0.1, 0.0], dtype=np.float32)
     )
@@ -118,7 +120,8 @@ def _steering(info: dict[str, Any]) -> np.ndarray[Any, Any]:
 
 
 def frames_per_second(jobs: dict[str, Job], turns: int) -> dict[str, float]:
-    """Median frames per second of each job; the jobs take turns."""
+    """Return the median over the `turns` of the frames per second of each job. The jobs take
+    turns."""
     figures: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(turns + 1):
         for name, job in jobs.items():
@@ -164,7 +167,8 @@ def kinds(stack: ExitStack) -> Iterator[tuple[str, Job]]:
 
 
 def measure(turns: int) -> dict[str, dict[str, float]]:
-    """Frames per second of all jobs, by group."""
+    """Return the frames per second of all jobs, by group and job; each figure is a median over
+    `turns`."""
     figures = {}
     for group in (environments, cameras, sizes, kinds):
         with ExitStack() as stack:

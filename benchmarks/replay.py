@@ -1,11 +1,11 @@
-"""Random episodes give bit-equal results in other processes and in vector environments.
+"""Checks that random episodes give bit-equal results in other processes and in vector environments.
 
 Run: `python benchmarks/replay.py [--episodes 100] [--json FILE]`; it takes about five minutes on
 two cores. Claim: 100 episodes give bit-equal observations, rewards, states, true features and info
 (a) in one process, (b) in another process that runs them in the opposite order, and (c) in parallel
-in Gymnasium's `AsyncVectorEnv`. Their track, lanes, traffic, start, control rate, controls, noise
-and sensors are random; every fifth episode also has pictures in a random light. The SHA-256 over
-all steps is compared.
+in Gymnasium's `AsyncVectorEnv`. Track, lanes, traffic, start, control rate, controls, noise and
+sensors of an episode are random; every fifth episode also has pictures in a random light. For each
+episode the SHA-256 over all its steps is compared.
 """
 
 import hashlib
@@ -44,7 +44,8 @@ Step = tuple[Any, float, bool, bool, dict[str, Any]]
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode: options and start of its environment, and the seed of reset and actions."""
+    """One episode: the options and the start of its environment, and the seed of its reset and of
+    its actions."""
 
     number: int
     seed: int
@@ -54,7 +55,7 @@ class Episode:
 
 
 def plan(count: int) -> list[Episode]:
-    """`count` random episodes; each call returns the same ones."""
+    """Return `count` random episodes. Each call returns the same episodes."""
     return [random_episode(number) for number in range(count)]
 
 
@@ -111,7 +112,8 @@ class Fingerprint(gym.Wrapper[Any, Any, Any, Any]):
         observation, reward, over, _, info = self.env.step(self._action(self._info))
         self._hash.update(struct.pack("<d?", reward, over))
         observation, self._info = self._told(observation, info)
-        # The vector must go on until all episodes are over, so an end changes only the digest.
+        # The vector environment must go on until all episodes are over, so the end of an episode
+        # changes only the digest.
         taken = observation, float(reward), False, False, self._info
         self._end = taken if over else None
         return taken
@@ -169,7 +171,7 @@ def run_beside(episodes: list[Episode]) -> dict[int, str]:
         alike = [episode for episode in episodes if episode.kind == kind]
         for first in range(0, len(alike), BESIDE_EACH_OTHER):
             group = alike[first : first + BESIDE_EACH_OTHER]
-            # The observation spaces differ in their limits, which include the noise.
+            # The episodes' observation spaces differ in their limits, which include the noise.
             vector = AsyncVectorEnv(
                 [maker(episode) for episode in group], observation_mode="different"
             )
@@ -186,7 +188,8 @@ def run_beside(episodes: list[Episode]) -> dict[int, str]:
 
 def main(episodes: int = 100, json: Path | None = None) -> None:
     planned, started = plan(episodes), time.perf_counter()
-    # Vectors run first, because they fork: this process must not have an OpenGL context yet.
+    # The vector environments run first, because they fork this process, which must not have an
+    # OpenGL context at that moment.
     beside = run_beside(planned)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         forwards = pool.submit(run_alone, planned)

@@ -8,7 +8,7 @@ so that other load on the machine affects both equally. The result also has the 
 request, which other load affects least.
 
     python benchmarks/service.py [--quick] [--out FILE]
-    claim: our overhead is at most 0.75 of the plain handler's
+    claim: our overhead is at most 0.75 of the plain handler's overhead
 """
 
 import json
@@ -28,11 +28,12 @@ from benchmarks.service_load.servers import processor_s
 from tests.serve.conftest import FakeEngine, jpeg, outputs, picture
 
 CLAIM = 0.75
-TURN = 50  # requests to one server before the next server's turn
+TURN = 50  # number of requests to one server before the next server's turn
 
 
 def plain(engine: FakeEngine) -> Any:
-    """A FastAPI app whose POST /features decodes, predicts and answers, and does nothing else."""
+    """Return a FastAPI app whose POST /features decodes the image, predicts by `engine` and
+    answers. It does nothing else."""
     from fastapi import FastAPI, Request
 
     from mtlnet.inference.image_decoding.decode import crop_and_resize, decode_whole, read_header
@@ -75,8 +76,8 @@ def serve(which: str, fd: int) -> None:
 
 
 class Forgetful(list[Any]):
-    """A list that stores nothing. The fake engine appends each image to its list; in this long run
-    the images would fill the memory."""
+    """A list that stores nothing. The fake engine appends each image to a list. In the long run of
+    this benchmark the images would fill the memory."""
 
     def append(self, _item: Any) -> None:
         pass
@@ -106,7 +107,8 @@ def connect(address: tuple[str, int]) -> socket.socket:
 
 
 def exchange(connection: socket.socket, request: bytes) -> bytes:
-    """Send a whole HTTP request and return the body of the answer, with little work of its own.
+    """Send a whole HTTP request and return the body of the answer. The function itself takes little
+    processor time.
 
     Raises RuntimeError if the status is not 200, ConnectionError if the server closes.
     """
@@ -142,7 +144,8 @@ class Asker:
         self._request = head.encode() + body
 
     def ask(self) -> tuple[float, float]:
-        """Send one request; return its time and the decoding and inference time in it, in ms."""
+        """Send one request. Return its time in ms, and the part of this time in ms that the server
+        spent with decoding and inference."""
         start = time.perf_counter()
         content = exchange(self._socket, self._request)
         total_ms = 1e3 * (time.perf_counter() - start)
@@ -151,7 +154,8 @@ class Asker:
 
 
 def measure(requests: int) -> dict[str, Any]:
-    """Send `requests` requests to each server in turns; return the figures and their ratio."""
+    """Send `requests` requests to each of the two servers in turns. Return the figures of both
+    servers, and the ratio of their overheads."""
     body = jpeg(picture())
     found = {name: Asked([], []) for name in ("driverview", "plain")}
     processes, askers = [], {}

@@ -1,4 +1,5 @@
-"""The service under attack: the answers that a well-behaved client gets, and the memory used.
+"""Measures the service under attack: the answers that a well-behaved client gets, and the memory
+that the service uses.
 
 Each attack of `tests.serve.attacks.registry` is repeated for `--seconds` by a process that knows
 the token. Meanwhile another process sends ten requests per second over one connection, like a car.
@@ -47,17 +48,18 @@ from trackfeatures.errors import UserError
 ANSWERED, SLOWER = 0.99, 3.0
 BODIES_MB, GROWTH_MB, LEFT_MB = 67.2, 60.0, 10.0
 RATE = 10.0  # requests per second of the well-behaved client
-HOLD_S = 1.0  # for which an attack keeps its connections open
+HOLD_S = 1.0  # time for which an attack keeps its connections open
 QUIET_S = 20.0
-SETTLE_S = 3.0  # least wait after each attack, in which the service frees its leftovers
+SETTLE_S = 3.0  # least wait after each attack, in which the service frees memory
 START_S = 120.0
 SPAWN = multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Result of one measurement: number of requests, share that was answered, p50 and p99 of their
-    times, and the largest resident memory of the service."""
+    """Result of one measurement: the number of requests of the well-behaved client, the share of
+    them that was answered, the p50 and p99 of their times (ms), and the largest resident memory of
+    the service (MB)."""
 
     requests: int
     answered: float
@@ -67,7 +69,8 @@ class Figures:
 
 
 def ask(connection: http.client.HTTPConnection, token: str) -> bool:
-    """Send one request, a second time if the connection failed; whether the status was 200."""
+    """Send one request, and send it a second time if the connection failed. Return whether the
+    status was 200."""
     headers = {"Content-Type": "image/jpeg", "Authorization": f"Bearer {token}"}
     for _ in range(2):
         try:
@@ -82,7 +85,8 @@ def ask(connection: http.client.HTTPConnection, token: str) -> bool:
 
 
 def behave(port: int, token: str, begun: Event, ended: Event, results: Any) -> None:
-    """Send RATE requests per second until `ended`; put a list of (answered, ms) into `results`."""
+    """Send a request that is not counted and set `begun`. Then send RATE requests per second until
+    `ended` is set. Put a list of (answered, ms), one for each request, into the queue `results`."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     ask(connection, token)
     begun.set()
@@ -97,7 +101,8 @@ def behave(port: int, token: str, begun: Event, ended: Event, results: Any) -> N
 
 
 def repeat(attack: Attack, target: Target, seconds: float, begun: Event) -> None:
-    """Repeat an attack for `seconds`; set `begun` before the first time."""
+    """Repeat `attack` on the service `target` for `seconds`. Set `begun` before the first
+    attack."""
     begun.set()
     end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
@@ -110,7 +115,8 @@ def repeat(attack: Attack, target: Target, seconds: float, begun: Event) -> None
 
 
 def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> Figures:
-    """Run the well-behaved client for `seconds`, with `attack` unless it is None."""
+    """Run the well-behaved client for `seconds`, together with `attack` unless it is None. `pid` is
+    the process of the service."""
     begun, attacked, ended = SPAWN.Event(), SPAWN.Event(), SPAWN.Event()
     results, attacker = SPAWN.Queue(), None
     arguments = (target.port, target.token or "", begun, ended, results)
@@ -138,7 +144,7 @@ def measure(target: Target, pid: int, seconds: float, attack: Attack | None) -> 
 
 
 def memory_mb(pid: int) -> float:
-    """Resident memory of a process and all its descendants in MB."""
+    """Return the resident memory in MB of the process `pid` and all its descendants."""
     total = 0.0
     for found in (pid, *descendants(pid)):
         with suppress(OSError):
@@ -173,14 +179,15 @@ def own_service(model: str) -> Iterator[tuple[Target, int]]:
 
 
 def log_lines(said: Any) -> int:
-    """Number of lines in the open file `said`."""
+    """Return the number of lines in the open file `said`, a log."""
     said.seek(0)
     return int(said.read().count(b"\n"))
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Options: seconds of each attack, longest wait after it in s, attacks, JSON on stdout."""
+    """Options of a run: the duration of each attack (s), the longest wait after an attack (s), the
+    attacks, and whether stdout is for JSON."""
 
     seconds: float
     settle_s: float
@@ -189,7 +196,8 @@ class Asked:
 
 
 def chosen(names: str) -> list[Attack]:
-    """The attacks with these names, separated by commas; all if empty. UserError if unknown."""
+    """Return the attacks whose names are in `names`, separated by commas; all attacks if `names` is
+    empty. Raises UserError for an unknown name."""
     wanted = set(names.split(",")) if names else {attack.__name__ for attack in ATTACKS}
     unknown = wanted - {attack.__name__ for attack in ATTACKS}
     if unknown:
@@ -222,7 +230,8 @@ def compare(target: Target, pid: int, asked: Asked) -> list[dict[str, Any]]:
 
 
 def settle(pid: int, limit_mb: float, at_most_s: float) -> float:
-    """Wait until the service's memory is at most `limit_mb`; return the seconds that it took."""
+    """Wait until the memory of the service with the process id `pid` is at most `limit_mb`, but at
+    most `at_most_s` s. Return the duration of the wait in s."""
     begin = time.monotonic()
     time.sleep(min(SETTLE_S, at_most_s))
     while memory_mb(pid) > limit_mb and time.monotonic() - begin < at_most_s:

@@ -2,8 +2,8 @@
 
 Each image is a JPEG or PNG with flipped bits, overwritten, cut or repeated parts, wrong numbers in
 its header, or another file after it. The decoder must return pixels or raise ImageError. Any other
-result is a fault; its seed, part and number reproduce it. Memory is measured after a tenth of the
-images and at the end, and must grow by less than 1 %.
+result is a fault; the seed, part and number in its message reproduce it. Memory is measured after a
+tenth of the images and at the end, and must grow by less than 1 % between the two measurements.
 
     python benchmarks/service_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """
@@ -30,7 +30,8 @@ VIEW = CameraParameters()
 
 
 def seeds() -> list[bytes]:
-    """Undamaged JPEG and PNG files to mutate; small, so that mutations often hit the headers."""
+    """Return undamaged JPEG and PNG files, which are then mutated. They are small, so that
+    mutations often hit the headers."""
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (21, 28, 3), np.uint8)
     progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
@@ -40,7 +41,7 @@ def seeds() -> list[bytes]:
 
 
 def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
-    """A random one of the images `whole` with one to four random changes."""
+    """Return a random image of `whole` with one to four random changes."""
     body = bytearray(whole[rng.integers(len(whole))])
     for _ in range(rng.integers(1, 5)):
         at, size = int(rng.integers(len(body))), int(rng.integers(1, 40))
@@ -63,10 +64,10 @@ def mutate(rng: np.random.Generator, whole: list[bytes]) -> bytes:
 
 
 def run_part(seed: int, part: int, count: int) -> tuple[int, int, float, list[str]]:
-    """Decode `count` damaged images.
+    """Decode `count` damaged images, which are determined by `seed` and `part`.
 
-    Returns how many gave pixels, how many were refused, the growth of memory as a share, and the
-    faults as messages.
+    Returns the number of images that gave pixels, the number of refused images, the growth of the
+    memory as a share, and a message for each fault.
     """
     whole, accepted, refused, faults = seeds(), 0, 0, []
     early = 0.0

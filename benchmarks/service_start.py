@@ -1,10 +1,11 @@
-"""Time from the command `serve` to the first "ready", with one worker, as a user starts it.
+"""Measures the time from the command `serve` until the service is ready, with one worker.
 
     python benchmarks/service_start.py [--model RUN] [--starts 5] [--json FILE]
     claim: less than 1 s
 
-The service is ready when /readyz, requested every 5 ms, answers 200: the model is loaded, warm and
-has passed its check. The first start is not counted, because it reads the programs from the disk.
+The service is ready when /readyz, which is requested every 5 ms, answers 200. The model is then
+loaded and warm, and has passed its check. The first start is not counted, because it reads the
+programs from the disk.
 Without --model the network is untrained.
 """
 

@@ -3,8 +3,8 @@
 A stream begins with a request, a handshake or both. They come from the attacks of the tests or from
 a grammar (`service_load/stream_grammar.py`). WebSocket frames follow if the handshake was accepted.
 The stream arrives in parts, on a transport that behaves like uvloop's. It is a fault if the service
-raises an exception, hangs, answers 500, logs an error or leaves objects behind. Seed, part and
-number reproduce a stream.
+raises an exception, hangs, answers 500, logs an error or leaves objects behind. The seed, part and
+number in the message of a fault reproduce its stream.
 
     python benchmarks/service_stream_fuzz.py [--count 1000000] [--seed 0] [--workers N]
 """
@@ -38,11 +38,12 @@ from tests.serve.conftest import FakeEngine, outputs
 
 MAX_GROWTH = 0.02
 HANG_S = 1.0  # processor time for one stream that counts as a hang
-TURNS = 8  # upper limit of the event loop's iterations after the parts of a stream
+TURNS = 8  # the event loop makes fewer iterations than this after the begin and after the frames
 
 
 class Transport:
-    """A transport without a socket. It stores what is written, and raises the errors of uvloop."""
+    """A transport without a socket. It stores the bytes that are written, and raises the same
+    errors as a transport of uvloop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
@@ -104,7 +105,8 @@ class Errors(logging.Handler):
 
 
 def opening(rng: random.Random, known: list[bytes]) -> bytes:
-    """The begin of a stream: from the grammar, or mutated from it or from the streams `known`."""
+    """Return the begin of a stream. It comes from the grammar, is mutated from a stream of the
+    grammar, or is mutated from one of the streams `known`."""
     made = [stream_grammar.message(rng) for _ in range(rng.choice([1, 1, 2]))]
     if rng.random() < 0.3:
         return b"".join(made)
@@ -112,7 +114,7 @@ def opening(rng: random.Random, known: list[bytes]) -> bytes:
 
 
 def frames(rng: random.Random) -> bytes:
-    """WebSocket frames, half of them mutated."""
+    """Return random WebSocket frames, mutated in half of the calls."""
     made = stream_grammar.frames(rng)
     return made if rng.random() < 0.5 else mutate(rng, [made])
 
@@ -120,7 +122,7 @@ def frames(rng: random.Random) -> bytes:
 async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
     """Give the bytes `sent` to the transport's protocol in parts of random size."""
     while sent and not transport.closing:
-        for _ in range(TURNS * TURNS):  # the client waits so many turns while reading is paused
+        for _ in range(TURNS * TURNS):  # largest wait of the client while reading is paused
             if not transport.paused:
                 break
             await asyncio.sleep(0)
@@ -136,7 +138,7 @@ async def feed(transport: Transport, rng: random.Random, sent: bytes) -> None:
 async def stream(make: Any, rng: random.Random, whole: list[bytes]) -> bytes:
     """Send one random stream over a new connection; return the bytes of the answers.
 
-    `make` makes the protocol; `whole` are the streams of the tests.
+    `make` makes the protocol; `whole` are the complete streams of the tests' attacks.
     """
     transport = Transport(asyncio.get_running_loop())
     transport.protocol = make()
@@ -154,7 +156,8 @@ async def stream(make: Any, rng: random.Random, whole: list[bytes]) -> bytes:
 
 
 async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
-    """Send `count` streams; return the growth of memory as a share, and the faults as messages."""
+    """Send `count` streams, which are determined by `seed` and `part`. Return the growth of the
+    memory as a share, and a message for each fault."""
     engine = FakeEngine(lambda _image: outputs())
     app = Service(engine, lambda _engine: None, Limits())
     config = uvicorn.Config(app, http="httptools", ws=GuardedWebSocket, log_config=None)
@@ -188,7 +191,7 @@ async def run_part(seed: int, part: int, count: int) -> tuple[float, list[str]]:
             faults.append(f"part {part}, number {number}: {error!r}")
         faults += [f"part {part}, number {number}: {said}" for said in errors.found]
         errors.found.clear()
-        engine.images.clear()  # the service's memory is measured, not the fake engine's
+        engine.images.clear()  # so that the images in the fake engine do not count as memory growth
         if number == count // 5:
             early_mb = resident_mb()
     while state.tasks:

@@ -1,13 +1,14 @@
 """Speed of the service in this checkout compared with another checkout, in one run.
 
 Each pair of measurements starts both services with the same model, one after the other; the order
-alternates from pair to pair. It measures the time from the command to the first answer in s, the
-times of an answer over one connection, the answers per second over eight connections, and the
+alternates from pair to pair. A measurement has the time from the command to the first answer in s,
+the times of an answer over one connection, the answers per second over eight connections, and the
 processor time of an answer.
 
     python benchmarks/service_versions.py --before CHECKOUT [--model RUN] [--pairs 9]
         [--seconds 8] [--out FILE]
-    claim: no median of the pairs is more than 3 % worse
+    claim: for each time, the median over the pairs of the ratio of the time in this checkout to the
+    time in CHECKOUT is at most 1.03
 
 CHECKOUT is a clone of this repository at another commit; it runs in the environment of this one.
 Without --model the weights are untrained: each checkout writes them in its own format, from the
@@ -48,9 +49,10 @@ publish_untrained(pathlib.Path(sys.argv[1]), seed=3)
 
 @contextmanager
 def models(run: Path | None, trees: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
-    """The folder of the model that each source tree serves.
+    """Yield the folder of the model that each source tree in `trees` serves, by the tree's name.
 
-    It is a copy of `run`. If `run` is None, each tree writes untrained weights in its own format.
+    The folder is a copy of `run`. If `run` is None, each tree writes untrained weights in its own
+    format.
     """
     if run is not None:
         with model_copy(run) as copy:
@@ -65,9 +67,9 @@ def models(run: Path | None, trees: Mapping[str, Path]) -> Iterator[dict[str, Pa
 
 
 def measure(root: Path, run: Path, loader: Loader, seconds: float) -> dict[str, float]:
-    """Start the service of the source tree `root` and return its times; less is better in all.
+    """Start the service of the source tree `root` and return its times; a lower time is better.
 
-    Times in ms except `start_s`; each of the two loads lasts `seconds`.
+    All times except `start_s` are in ms. Each of the two loads lasts `seconds`.
     """
     begin = time.perf_counter()
     with running(OURS, Path(sys.executable), run, 1, root=root) as port:

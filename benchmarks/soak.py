@@ -3,8 +3,8 @@
 Run: `python benchmarks/soak.py [--hours 8] [--json FILE]`; it takes about five minutes on one core.
 Claim: after the warm-up, which contains every kind of drive, the resident memory grows by less than
 1 %. Environments are created, driven, reset and closed repeatedly, on all tracks of the project,
-with one to three lanes and 0 to 12 cars. After every second drive follows a short one with pictures
-and a new camera.
+with one to three lanes and 0 to 12 cars in the traffic. After every second drive follows a short
+drive with pictures and a new camera.
 """
 
 import os
@@ -33,7 +33,8 @@ DRIVE_STEPS = 6000
 RESET_EVERY = 1200
 PICTURE_STEPS = 40
 WARM_UP_DRIVES = 60
-"""Each track with 1, 2 and 3 lanes, twice. The heap grows until then."""
+"""Each of the ten tracks is driven with 1, 2 and 3 lanes, twice. The heap grows during these
+drives."""
 COMPARED = 10
 """The medians of the first and of the last ten samples are compared, because a single sample
 depends on the environment of the last drive, which is still in memory."""
@@ -49,21 +50,23 @@ class Sample:
 
 
 def resident_mib() -> float:
-    """Resident memory of this process in MiB."""
+    """Return the resident memory of this process in MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def steering(info: dict[str, Any], wander: float) -> np.ndarray[Any, Any]:
-    """Action (1,) that steers towards an offset of `wander` m left of the centre line."""
+    """Return the action (1,) that steers towards an offset of `wander` m left of the centre line.
+    `info` is the additional output of the environment."""
     wheel = 2.0 * info["angle"] - 0.2 * (info["to_middle"] - wander)
     return np.array([min(max(wheel, -1.0), 1.0)], np.float32)
 
 
 def drive(number: int, tracks: list[str], steps: int) -> int:
-    """Make, drive and close environment `number`; return how often it was reset.
+    """Make the environment of drive `number`, drive it for `steps` steps and close it; return the
+    number of resets.
 
-    After every second drive follows a short one with pictures.
+    After every second drive follows a short drive with pictures.
     """
     # Ten tracks and three lane counts: thirty drives in a row all differ.
     options: dict[str, Any] = {
@@ -84,7 +87,7 @@ def drive(number: int, tracks: list[str], steps: int) -> int:
         )
         steps_with_resets(seen, number, PICTURE_STEPS, RESET_EVERY)
         if number % 4 == 0:
-            seen.close()  # the other ones are not closed, because users forget it, too
+            seen.close()  # half of the environments stay open, because users forget to close them
     return resets
 
 

@@ -1,12 +1,12 @@
-"""Steps per second of the state environment, CarRacing-v3 and highway-env's racetrack-v0.
+"""Measures steps per second of the state environment, CarRacing-v3 and highway-env's racetrack-v0.
 
 Run: `python benchmarks/state_env.py [--json FILE]`; it takes about two minutes on two cores.
 Claims, on one core with 19 range beams in every step: at least 4,000 steps per second, 20 times as
 many as CarRacing-v3 and 40 times as many as racetrack-v0. The environments take turns in one
 process pinned to one core. A figure is the median over the turns of the steps per second of
-processor time, without resets. Before that, the beams of a short drive are compared with a
-brute-force computation (limit 0.02 m). Vectors of two environments are timed by wall time on two
-cores.
+processor time, without resets. Before these measurements, the beams of a short drive are compared
+with a brute-force computation (limit 0.02 m). Vector environments of two environments each are
+timed by wall time on two cores.
 """
 
 import os
@@ -42,15 +42,17 @@ Policy = Callable[[dict[str, Any]], Action]
 
 
 def make(**options: Any) -> gym.Env[Any, Any]:
-    """The state environment that is compared: the paper's state and 19 range beams."""
+    """Make the state environment that is compared. Its observation is the paper's state and 19
+    range beams."""
     name = "driverview/LateralControl-v0"
     return gym.make(name, track="circuit", sensors=("range",), **options)
 
 
 def steering(info: dict[str, Any]) -> Action:
-    """Action that steers along the centre line, from the info of one environment or of a vector.
+    """Return the action that steers along the centre line. `info` is the info of one environment or
+    of a vector environment.
 
-    Its shape is (1,) or, for a vector of N, (N, 1).
+    The shape of the action is (1,) or, for a vector environment of N, (N, 1).
     """
     wheel = np.clip(2.0 * info["angle"] - 0.2 * info["to_middle"], -1.0, 1.0)
     return np.asarray(wheel, np.float32).reshape(*np.shape(wheel), 1)
@@ -62,7 +64,8 @@ def constant(*values: float) -> Policy:
 
 
 def steps_per_second(env: gym.Env[Any, Any], policy: Policy, steps: int, seed: int) -> float:
-    """Steps per second of processor time of this process; policy included, resets not."""
+    """Return the steps per second of processor time of this process. The time includes the policy,
+    but not the resets."""
     _, info = env.reset(seed=seed)
     spent, started = 0.0, time.process_time()
     for _ in range(steps):
@@ -75,7 +78,8 @@ def steps_per_second(env: gym.Env[Any, Any], policy: Policy, steps: int, seed: i
 
 
 def beams_error(steps: int) -> float:
-    """Largest difference in m between range beams and brute force in a drive of `steps` steps."""
+    """Return the largest difference in m between the range beams and the brute-force computation in
+    a drive of `steps` steps."""
     env = make()
     unwrapped = env.unwrapped
     assert isinstance(unwrapped, simulator.env.LateralControl)
@@ -92,7 +96,8 @@ def beams_error(steps: int) -> float:
 
 
 def compare() -> dict[str, float]:
-    """Median steps per second of processor time of each environment; they take turns."""
+    """Return the median steps per second of processor time of each environment. The environments
+    take turns."""
     contestants: dict[str, tuple[gym.Env[Any, Any], Policy, int]] = {
         f"driverview, {cars} cars": (make(traffic=cars, lanes=3), steering, STEPS["driverview"])
         for cars in (0, 6, 12)
@@ -116,7 +121,8 @@ def compare() -> dict[str, float]:
 
 
 def vector_steps_per_second(mode: str) -> float:
-    """Steps per second of wall time of two environments in one vector, summed over both."""
+    """Return the steps per second of wall time of two environments in one vector environment,
+    summed over both. `mode` is Gymnasium's vectorization mode: "sync" or "async"."""
     name = "driverview/LateralControl-v0"
     vector: Any = gym.make_vec(name, 2, mode, track="circuit", sensors=("range",))
     _, info = vector.reset(seed=0)
@@ -132,7 +138,8 @@ def vector_steps_per_second(mode: str) -> float:
 def main(json: Path | None = None) -> None:
     warnings.simplefilter("ignore")  # the peers print warnings
     cores = os.sched_getaffinity(0)
-    # Before this process is pinned to one core, because the workers inherit its cores.
+    # The vectors are timed before this process is pinned to one core, because their worker
+    # processes inherit its cores.
     vectors = {mode: round(vector_steps_per_second(mode)) for mode in ("sync", "async")}
     os.sched_setaffinity(0, {min(cores)})
     error = beams_error(CHECKED_STEPS)

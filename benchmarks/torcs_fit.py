@@ -1,9 +1,10 @@
-"""Flying laps of the simulated car and in the real TORCS, with the same control law and tracks.
+"""Compares flying laps of the simulated car with flying laps in the real TORCS, with the same
+control law and tracks.
 
 Run: `TORCS_TRACKS=FOLDER python benchmarks/torcs_fit.py [--json FILE]`. FOLDER contains `tracks/`
-and the reference laps `drives/NAME-lqr.csv`. Limits of the differences: steps 1 %, score per step
-0.004, mean |d| 0.02 m, max |d| 0.15 m (d: offset from the middle). The exit code is 1 if a limit is
-missed, 3 without reference laps.
+and the recorded laps `drives/NAME-lqr.csv`. Limits of the differences: number of steps 1 %, score
+per step 0.004, mean |d| 0.02 m, largest |d| 0.15 m (d: offset from the centre line). The exit code
+is 1 if a difference is above its limit, and 3 if there are no recorded laps.
 """
 
 import os

@@ -1,8 +1,8 @@
-"""Traffic of twelve cars for ten minutes, with one, two and three lanes on every track.
+"""Checks the traffic of twelve cars for ten minutes, with one, two and three lanes on every track.
 
 Run: `python benchmarks/traffic.py [--minutes 10] [--tracks town,highway] [--json FILE]`. Claim: two
-cars never overlap, both with a driving ego car and with one parked in the rightmost lane, and cars
-change lanes on two and three lanes. The exit code is 1 if this does not hold.
+cars never overlap, both with a driving ego car and with an ego car parked in the rightmost lane.
+Cars change lanes on roads with two and three lanes. The exit code is 1 if the claim does not hold.
 """
 
 import sys
@@ -21,7 +21,8 @@ from tests.simulator.traffic_audit import TrafficViolation, audit_traffic
 
 
 def one(case: tuple[str, int, bool], seconds: float) -> dict[str, Any]:
-    """Audit the traffic of one (track, lanes, ego car parked) for `seconds` of simulated time.
+    """Audit the traffic of one case for `seconds` of simulated time. A case is (track, number of
+    lanes, whether the ego car is parked).
 
     Returns the case with its statistics, or with the violation that was found.
     """

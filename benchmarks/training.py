@@ -1,4 +1,4 @@
-"""Training speed on a CPU; the two sides of each claim take turns in one run.
+"""Measures the training speed on a CPU. The two kinds of steps that a claim compares take turns.
 
 Run: `python benchmarks/training.py [--data DIR] [--quick] [--json FILE]`. Claims for the recipe
 `fast` on a quiet machine: (1) In batches of 32, a step with real data (reading, decoding, all
@@ -53,7 +53,8 @@ Step = Callable[[], object]
 
 
 def ours(frames: Frames, size: int, steps: int) -> dict[str, Step]:
-    """Our training step: on new batches with and without augmentation, and on one in memory.
+    """Return our training steps by name: on new batches with and without augmentation, and on one
+    batch in memory.
 
     The progress of the run goes from 0 to 1 in `steps` calls of a step, so layers freeze as in a
     whole run. The steps named `all` stay at the start of a run, where all layers learn.
@@ -78,7 +79,8 @@ def ours(frames: Frames, size: int, steps: int) -> dict[str, Step]:
 
 
 def plain(frames: Frames, size: int) -> Step:
-    """A plain torch training step with the same decoder and network, AdamW and a DataLoader."""
+    """Return a plain torch training step with the same decoder and network, AdamW and a
+    DataLoader."""
     from torch.utils.data import DataLoader
     from torch.utils.data import Dataset as TorchDataset
 
@@ -122,9 +124,10 @@ def plain(frames: Frames, size: int) -> Step:
 
 
 def measure(frames: Frames, size: int, rounds: int, steps: int) -> dict[str, Any]:
-    """Time every kind of step for `rounds` turns of `steps` steps each, in turns.
+    """Time every kind of step. In each of the `rounds` turns, every kind makes `steps` steps.
 
-    Returns medians over the turns (ms), images per second and ratios.
+    Returns the medians over the turns of the times of a step (ms), the images per second and the
+    ratios of the claims.
     """
     ways = {"plain": plain(frames, size), **ours(frames, size, steps)}
     times: dict[str, list[float]] = {name: [] for name in ways}
@@ -156,7 +159,8 @@ def measure(frames: Frames, size: int, rounds: int, steps: int) -> dict[str, Any
 
 
 def judge(frames: Frames, rounds: int, steps: int) -> dict[str, Any]:
-    """Measure with batches of 32 and of the recipe's size, and compare with the claims."""
+    """Measure with batches of 32 and with batches of the recipe's size, and compare the results
+    with the claims."""
     torch.set_num_threads(CORES)
     cv2.setNumThreads(1)
     found = {size: measure(frames, size, rounds, steps) for size in (SMALL, OWN)}

@@ -1,9 +1,10 @@
-"""Steps per second of 256 cars in one vector environment, of single environments and of peers.
+"""Measures steps per second of 256 cars in one vector environment, of single environments and of
+environments of other projects.
 
 Run: `python benchmarks/vector_env.py [--json FILE]`; it takes about three minutes on two idle
-cores. Claims: 50,000 car steps per second on one core and 90,000 on two cores without beams, 60,000
-on two cores with 19 range beams in each step, and at most 12 microseconds per car for the compiled
-control step.
+cores. Claims: at least 50,000 car steps per second on one core and 90,000 on two cores without
+range beams, at least 60,000 on two cores with 19 range beams in each step, and at most 12
+microseconds per car for the compiled control step.
 
 On one core, all environments take turns in one process pinned to it. A figure is the median over
 the turns of car steps per second of processor time, including policy and resets. Runs on two
@@ -40,7 +41,8 @@ TURNS = 5
 START = {"speed": 15.0}
 
 Step = Callable[[], int]
-"""Makes some control steps; returns the number of car steps (control steps times cars)."""
+"""A function that makes some control steps and returns the number of car steps (control steps times
+cars)."""
 
 
 def cars(threads: int, sensors: tuple[str, ...]) -> LateralControlVector:
@@ -88,7 +90,7 @@ def constant(vector: Any, action: tuple[float, ...], steps: int) -> Step:
 
 
 def kernel_us(vector: LateralControlVector, steps: int) -> float:
-    """Processor time in us of the compiled control step, per car and step."""
+    """Return the processor time in us of the compiled control step, per car and step."""
     inside = vector._cars
     arguments = (inside.fleet.arrays, inside._steps, inside._outputs, inside._rules)
     started = time.process_time()
@@ -98,7 +100,8 @@ def kernel_us(vector: LateralControlVector, steps: int) -> float:
 
 
 def one_core() -> tuple[dict[str, float], float]:
-    """Median car steps per second of processor time of each contestant, and `kernel_us`."""
+    """Return the median car steps per second of processor time of each environment, by name, and
+    the median of `kernel_us`."""
     vector = cars(1, ())
     singles = gym.make_vec(NAME, 2, vectorization_mode="sync", track="circuit", start=START)
     contestants = {
@@ -123,7 +126,8 @@ def one_core() -> tuple[dict[str, float], float]:
 
 
 def two_cores(sensors: tuple[str, ...]) -> float:
-    """Median car steps per second of wall time on two threads."""
+    """Return the median car steps per second of wall time on two threads. `sensors` are the sensors
+    of the vector environment."""
     run = drive(cars(2, sensors), 40)
     run()
     figures = []

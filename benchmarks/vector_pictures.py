@@ -1,13 +1,14 @@
-"""Processor time of a step with a picture: vector environment compared with single environment.
+"""Compares the processor time of a step with a picture in a vector environment and in a single
+environment.
 
 Run: `python benchmarks/vector_pictures.py [--json FILE]`; it takes about a minute on an idle core.
 In the vector environment two workers draw the pictures (280 x 210 px) of eight cars. Claim: a step
 of one car with its picture takes at most 1.15 times the processor time of a step of a single
-environment. The time of all processes is counted.
+environment. The processor time of all processes is counted.
 
-The two environments take turns on the same stretch of road. The single environment drives it eight
-times per turn, so that both make the same number of steps. Each process draws in one thread. A
-figure is the median over the turns.
+The two environments take turns on the same stretch of road. The single environment drives this
+stretch eight times per turn, so that both make the same number of car steps. Each process draws in
+one thread. A figure is the median over the turns.
 """
 
 import os
@@ -34,7 +35,8 @@ START = {"speed": 15.0}
 
 
 def processor_s(processes: list[int]) -> float:
-    """Processor time in s that the processes with these ids have used so far, in all."""
+    """Return the processor time in s that the processes with the ids `processes` have used so far,
+    summed over them."""
     times = 0
     for process in processes:
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()

@@ -1,4 +1,5 @@
-"""Time of `datagen verify --level full`, and of only reading and hashing the same files.
+"""Measures the time of `datagen verify --level full`, and of only reading and hashing the same
+files.
 
 Run: `python benchmarks/verification.py [--data DIR] [--json FILE]`. Claim: at most 15 s for 120,000
 frames on two cores, with the files in the page cache. Without `--data`, 60 rounds of 2,000 frames
@@ -29,7 +30,8 @@ REPEATS = 3
 
 
 def hash_files(folder: Path) -> None:
-    """Read all rounds and compute their SHA-256 and CRC-32: the least work of such a check."""
+    """Read all rounds in `folder` and compute their SHA-256 and CRC-32. A check that compares these
+    two sums cannot take less time."""
 
     def one(file: Path) -> str:
         data = file.read_bytes()

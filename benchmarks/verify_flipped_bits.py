@@ -2,9 +2,9 @@
 
 Run: `python benchmarks/verify_flipped_bits.py [--flips 1000] [--seed 0] [--data DIR] [--json
 FILE]`. One bit of one file is flipped, the dataset is verified, and the bit is restored. Three of
-four flips are in random bytes of the rounds, one is in another file: states, splits, the manifest
-or a file that the manifest lists. Without `--data` a few rounds are collected. A given dataset is
-copied first.
+four flips are in random bytes of the rounds. Every fourth flip is in another file: states, splits,
+the manifest or a file that the manifest lists. Without `--data` a few rounds are collected. If a
+dataset is given by `--data`, it is copied first.
 """
 
 import shutil

@@ -1,4 +1,5 @@
-"""Processor time per frame in each light, relative to the clear light of the same scene.
+"""Measures the processor time per frame in each kind of light, relative to the clear light of the
+same scene.
 
 Run: `python benchmarks/weather.py [--poses 40] [--json FILE]`; `--poses` is the number of poses on
 each track. Claim: rain and snow take at most 1.25 times the processor time of the clear light, with
@@ -29,9 +30,10 @@ PASSES = 3
 
 
 def measure(poses: int) -> dict[str, float]:
-    """Processor time of a frame in ms by kind of light.
+    """Return the processor time of a frame in ms by kind of light.
 
-    It is the median over the poses; the time of a pose is the shortest of PASSES.
+    The time is the median over the poses. The time of a pose is the shortest time of PASSES
+    renderings.
     """
     best: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for track in TRACKS:

@@ -27,9 +27,10 @@ def run_command(main: Callable[..., None]) -> None:
 
 
 def conclude(figures: object, file: Path | None, reached: bool | None) -> NoReturn:
-    """Print `figures` as JSON, write them to `file` if one is given, and exit with the code.
+    """Print `figures` as JSON, write them to `file` if it is not None, and exit.
 
-    `reached` is None if the claim was not measured.
+    `reached`: whether the claim was reached; None if it was not measured. The exit code is
+    `exit_code(reached)`, or NOT_MEASURED if `reached` is None.
     """
     text = json.dumps(figures, indent=1)
     print(text)
@@ -39,7 +40,8 @@ def conclude(figures: object, file: Path | None, reached: bool | None) -> NoRetu
 
 
 def exit_code(reached: bool) -> int:
-    """The exit code of a benchmark that measured its claim: 0 if it was reached, else 1."""
+    """Return the exit code of a benchmark that measured its claim: 0 if the claim was reached, else
+    1."""
     return REACHED if reached else MISSED
 
 

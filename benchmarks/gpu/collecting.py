@@ -1,10 +1,11 @@
 """Defines and counts the datasets of a GPU run: three for evaluation, one for training.
 
 `test` has the tracks that models are trained on; four fifths of its rounds are test rounds, and the
-timed recipes train on the others. `unseen` has tracks that no model is trained on. `random` has
-random roads of varied appearance. Half of the rounds of `train` are on the tracks, with lanes of
-4.0 m, and half on random roads of varied appearance. The parts of `train` are collected at the same
-time, because one core needs 20 s to plan random roads, and are then merged.
+timed recipes train on the remaining fifth. `unseen` has tracks that no model is trained on.
+`random` has random roads of varied appearance. Half of the rounds of `train` are on the training
+tracks, with lanes of 4.0 m, and half are on random roads of varied appearance. The parts of `train`
+are collected at the same time, because one core needs 20 s to plan random roads. Then the parts are
+merged.
 """
 
 import json
@@ -23,9 +24,10 @@ FREQUENCY_HZ = 4
 VARIED = ("--roads", "varied", "--tracks", "random")
 WORKERS_A_PART = 4
 IMAGE_BYTES = (210 - 66) * 280 * 3
-"""Size of a frame in GPU memory: RGB, without the sky (the upper 66 rows)."""
+"""Bytes of a frame in GPU memory: RGB, without the sky (the upper 66 of 210 rows)."""
 MEMORY_SHARE = 0.5
-"""Share of the GPU's memory for frames. The loader uses at most 0.6 of the free memory."""
+"""Share of the GPU's memory that the train frames may fill. The loader uses at most 0.6 of the free
+memory."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Collection:
     options: tuple[str, ...]
 
     def command(self, folder: Path) -> Command:
-        """The command that records into `folder`/NAME, with output and log beside it."""
+        """Return the command that records into `folder`/NAME. Its output and its log are files in
+        `folder`."""
         words = [sys.executable, "-m", "datagen", "collect", "--json"]
         words += ["--out", str(folder / self.name), "--prefix", self.name]
         words += ["--seed", str(self.seed), "--frequency", str(FREQUENCY_HZ)]
@@ -51,7 +54,8 @@ class Collection:
 
 
 def evaluation_collections(size: Size, cores: int) -> list[Collection]:
-    """The collections `test`, `unseen` and `random`; workers in proportion to their rounds."""
+    """Return the collections `test`, `unseen` and `random`. The number of workers of a collection
+    is in proportion to the number of its rounds."""
     rounds = {"test": size.test_rounds, "unseen": size.unseen_rounds, "random": size.random_rounds}
     options: dict[str, tuple[str, ...]] = {
         "test": ("--split-test-share", "0.8"),
@@ -66,7 +70,8 @@ def evaluation_collections(size: Size, cores: int) -> list[Collection]:
 
 
 def train_collections(size: Size, cores: int, frames: int) -> list[Collection]:
-    """The parts of `train` with `frames` frames in all, alternately on tracks and random roads."""
+    """Return the parts of `train`, which together have at least `frames` frames. The parts are
+    alternately on the training tracks and on random roads."""
     parts = max(2 * (cores // (2 * WORKERS_A_PART)), 2)
     rounds = max(-(-frames // (parts * size.train_frames)), 1)
     share = ("--split-test-share", "0", "--stretch", "1")
@@ -84,9 +89,10 @@ def train_collections(size: Size, cores: int, frames: int) -> list[Collection]:
 
 
 def most_frames(size: Size, gpu_bytes: int) -> int:
-    """Number of train frames that the GPU's memory holds, at most `size.most_train_frames`.
+    """Return the number of train frames that fit into the GPU's memory of `gpu_bytes`, but at most
+    `size.most_train_frames`.
 
-    Without a GPU (`gpu_bytes` 0) it is `size.most_train_frames`.
+    Without a GPU (`gpu_bytes` is 0) the result is `size.most_train_frames`.
     """
     if not gpu_bytes:
         return size.most_train_frames
@@ -94,11 +100,12 @@ def most_frames(size: Size, gpu_bytes: int) -> int:
 
 
 def counted(folder: Path, collections: list[Collection], ended: list[Ended]) -> dict[str, Any]:
-    """Frames of the finished rounds by collection, and the speed of all collections together.
+    """Return the numbers of frames in the finished rounds by collection, and the speed of all
+    collections together.
 
-    `whole_frames_per_second` includes start and planning, until the last call ended.
-    `frames_per_second` is the sum of the recording speeds that the calls print, None if one was
-    stopped.
+    `whole_frames_per_second` is the number of frames divided by the time from the start of the
+    calls of `datagen collect` to the end of the last call, including planning. `frames_per_second`
+    is the sum of the recording speeds that the calls print, None if a call was stopped.
     """
     frames = {each.name: finished_frames(folder / each.name) for each in collections}
     seconds = max(end.seconds for end in ended)
@@ -122,6 +129,6 @@ def finished_frames(folder: Path) -> int:
 
 
 def _speed(folder: Path, collection: Collection) -> float:
-    """Frames per second that `datagen collect` printed for this collection."""
+    """Return the frames per second that `datagen collect` printed for `collection`."""
     said = json.loads((folder / f"{collection.name}.json").read_text(encoding="utf-8"))
     return float(said["frames_per_second"])

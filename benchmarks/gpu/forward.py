@@ -26,7 +26,8 @@ Pass = Callable[[], Tensor]
 
 
 def passes(network: Network, images: Tensor) -> dict[str, Pass]:
-    """Functions that compute the outputs (B, 9) for `images` (B, 210, 280, 3) uint8, by name."""
+    """Return functions that compute the outputs (B, 9) for `images` (B, 210, 280, 3) uint8, by the
+    name of the variant."""
 
     def f32() -> Tensor:
         return network.forward_heads(network.forward_features(images))
@@ -60,7 +61,8 @@ def recorded(forward: Pass) -> Pass:
 
 
 def median_ms(forward: Pass, device: torch.device, count: int) -> float:
-    """Median time in ms of `count` passes, after as many passes for warming up."""
+    """Return the median time in ms of `count` passes. The same number of passes is made first, to
+    warm up."""
     times = []
     for _ in range(2 * count):
         begin = time.perf_counter()

@@ -1,7 +1,7 @@
 """Finds out what a machine lacks for a GPU run: packages, EGL on the GPU, TORCS's tracks, a GPU.
 
-Each question is answered by a separate process, so that this process uses no GPU memory and no
-OpenGL context.
+Each of these is found out by a separate Python process, so that this process uses no GPU memory and
+no OpenGL context.
 """
 
 import json
@@ -40,9 +40,10 @@ print(json.dumps({{"tracks": len(found), "torcs": {TORCS_TRACK!r} in found}}))
 
 
 def describe_machine() -> dict[str, Any]:
-    """Processor cores, Python, torch, GPU, renderer and tracks of this machine.
+    """Return the processor cores, Python, torch, GPU, renderer and tracks of this machine.
 
-    `errors` has a message for each question that failed. The packages must be installed.
+    `errors` in the result has a message for each Python program of a question that failed. The
+    packages of the project must be installed.
     """
     found: dict[str, Any] = {
         "python": platform.python_version(),
@@ -84,7 +85,8 @@ def ask(question: str) -> dict[str, Any] | str:
 
 
 def missing(found: dict[str, Any], *, gpu: bool = True) -> list[str]:
-    """Messages for all that the machine `found` (`describe_machine`) lacks for a run.
+    """Return a message for each thing that a machine lacks for a run. `found` is the machine's
+    description, a result of `describe_machine`.
 
     `gpu`: whether the run needs a GPU.
     """
@@ -107,7 +109,8 @@ def missing(found: dict[str, Any], *, gpu: bool = True) -> list[str]:
 
 
 def missing_at_all(*, gpu: bool = True) -> tuple[dict[str, Any], list[str]]:
-    """The description of this machine ({} if packages are missing), and messages for its lacks."""
+    """Return the description of this machine ({} if packages are missing), and a message for each
+    thing that it lacks for a run. `gpu`: whether the run needs a GPU."""
     packages = missing_packages()
     if packages:
         named = ", ".join(packages)

@@ -21,26 +21,28 @@ SECONDS = {
     "paper": 75.0,
     "end": 5.0,
 }
-"""Seconds of each stage in a run of ten minutes, in the order of the stages; runs of other lengths
-scale them. Time that a stage does not use goes to the next stages, most of it to `train`, which
-leaves only the seconds of the stages after it."""
+"""Seconds of each stage in a run of ten minutes, in the order of the stages. In a run of another
+length they are scaled. Time that a stage does not use goes to the next stages. Most of it goes to
+`train`, which leaves the stages after it only their own seconds."""
 STAGES = tuple(name for name in SECONDS if name not in ("check", "end"))
 LEAST_MINUTES, MOST_MINUTES = 1.0, 600.0
 
 LOADED_FRAMES_PER_SECOND = 6_000.0
-"""Least speed of reading a dataset for a training: images are decoded twice, and the road ahead
-is read."""
+"""Lowest expected speed of reading a dataset for a training. While a dataset is read, each image is
+decoded twice, and the road ahead is read."""
 LOAD_S, FINISH_S = 12.0, 50.0
-"""Seconds of `train` in a run of ten minutes for its start, and for the fit of the uncertainty head
-at its end."""
+"""Seconds that the stage `train` needs in a run of ten minutes for its start (LOAD_S), and for the
+fit of the uncertainty head at its end (FINISH_S)."""
 LEAST_TRAINED_SHARE = 0.25
-"""Least share of the seconds of `train` that it gets after delays, and least share of its time for
-training steps if reading the data takes longer than planned."""
+"""Least share of its planned seconds that the stage `train` gets if earlier stages took too long.
+Also the least share of the time of `train` that is used for training steps if reading the data
+takes longer than planned."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The deadlines of a run of `minutes` minutes. UserError if these are too few or too many."""
+    """The deadlines of a run of `minutes` minutes. Raises UserError for too few or too many
+    minutes."""
 
     minutes: float
 
@@ -52,7 +54,7 @@ class Plan:
 
     @property
     def scale(self) -> float:
-        """Factor on SECONDS: the length of this run divided by their sum."""
+        """Factor on SECONDS: the length of this run (s) divided by the sum of SECONDS."""
         return 60.0 * self.minutes / sum(SECONDS.values())
 
     def deadline(self, stage: str) -> float:
@@ -61,10 +63,13 @@ class Plan:
         return self.scale * sum(SECONDS[name] for name in names[: names.index(stage) + 1])
 
     def seconds(self, stage: str, now: float) -> float:
-        """Seconds that `stage` may take when it begins at `now` (s), 0 when the run is over.
+        """Return the seconds that `stage` may take when it begins at `now` (s from the start of the
+        run); 0 when the run is over.
 
-        A stage may take until its deadline, but at least its own seconds if it begins late. `train`
-        gets only a quarter of its own, so it makes up for earlier delays, `paper` for later ones.
+        A stage may take until its deadline. If it begins late, it may take at least its planned
+        seconds, but not longer than until the end of the run. `train` may then take at least a
+        quarter of its planned seconds, so it makes up for earlier delays. The last stage, `paper`,
+        makes up for delays after `train`.
         """
         share = LEAST_TRAINED_SHARE if stage == "train" else 1.0
         own = self.scale * share * SECONDS[stage]
@@ -72,7 +77,8 @@ class Plan:
         return max(min(max(self.deadline(stage) - now, own), until_end), 0.0)
 
     def train_minutes(self, now: float, frames: int) -> float:
-        """Minutes for training steps on `frames` frames if `train` begins at `now` (s)."""
+        """Return the minutes for training steps on `frames` frames if the stage `train` begins at
+        `now` (s from the start of the run)."""
         left = self.seconds("train", now)
         around = self.scale * (LOAD_S + FINISH_S) + frames / LOADED_FRAMES_PER_SECOND
         return max(left - around, LEAST_TRAINED_SHARE * left, 1.0) / 60.0
@@ -83,25 +89,26 @@ class Size:
     """The amounts of data, training steps and timed passes of a run."""
 
     test_rounds: int
-    """Rounds on the training tracks; a fifth are train rounds, for the two timed recipes."""
+    """Number of rounds of the dataset `test`. A fifth of them are train rounds, with which the two
+    timed recipes train."""
     unseen_rounds: int
     random_rounds: int
     frames: int
-    """Frames in each round of the three datasets for evaluation."""
+    """Number of frames in each round of the three datasets for evaluation."""
     train_frames: int
-    """Frames in each train round."""
+    """Number of frames in each round of the dataset `train`."""
     most_train_frames: int
-    """Largest number of train frames in all; the GPU's memory may hold fewer."""
+    """Largest number of frames of the dataset `train`; fewer if the GPU's memory is too small."""
     timed_steps: dict[str, int]
-    """Steps of the timed trainings, by recipe."""
+    """Number of training steps of the timed trainings, by recipe."""
     batches: tuple[int, ...]
     """Batch sizes of the forward passes."""
     passes: int
-    """Forward passes of each batch that are timed, after as many for warming up."""
+    """Number of timed forward passes for each batch size, after the same number for warming up."""
     iterations: int | None
-    """Steps of the training; None: as many as fit into its minutes."""
+    """Number of steps of the training; None: as many as fit into the minutes of the stage."""
     batch: int | None
-    """Batch size of the training, unless `--batch` is given; None: the recipe's."""
+    """Batch size of the training, unless `--batch` is given; None: the batch size of the recipe."""
     device: str
 
 

@@ -1,4 +1,5 @@
-"""Runs the commands of a stage in parallel until a deadline, then stops those that still run."""
+"""Runs the commands of a stage in parallel until a deadline, then stops the commands that still
+run."""
 
 import os
 import signal
@@ -10,7 +11,8 @@ from pathlib import Path
 from types import FrameType
 
 GRACE_S = 12.0
-"""From SIGTERM to SIGKILL: time for a training to save a checkpoint, or a collection its list."""
+"""Time (s) from SIGTERM to SIGKILL. In this time a training saves a checkpoint, or a collection the
+list of its rounds."""
 POLL_S = 0.1
 LOG_LINES = 30
 
@@ -47,8 +49,9 @@ def run(
 ) -> list[Ended]:
     """Run `commands` in parallel for at most `seconds`, or until `enough()` is true.
 
-    Commands that still run then get SIGTERM and, after `grace_s`, SIGKILL with all their processes.
-    The same happens when this process is interrupted.
+    Commands that still run at this moment get SIGTERM. After `grace_s` (s) they get SIGKILL, with
+    all their child processes. Commands are stopped in the same way when this process is
+    interrupted.
     """
     begin = time.monotonic()
     running = [_start(command) for command in commands]
@@ -81,7 +84,8 @@ def _start(command: Command) -> subprocess.Popen[bytes]:
 
 
 def _stop(running: Sequence[subprocess.Popen[bytes]], grace_s: float) -> None:
-    """End the running processes. Processes that have ended left no children: our commands wait."""
+    """End the running processes. Only these can have child processes, because the commands of this
+    project wait for their child processes before they end."""
     left = [process for process in running if process.poll() is None]
     for process in left:
         process.terminate()
@@ -95,7 +99,7 @@ def _stop(running: Sequence[subprocess.Popen[bytes]], grace_s: float) -> None:
 
 
 def log_tail(log: Path) -> str:
-    """The last lines of a log, without the intermediate states of progress bars."""
+    """Return the last lines of the file `log`, without the intermediate states of progress bars."""
     text = log.read_text(errors="replace") if log.is_file() else ""
     lines = [line.rsplit("\r", 1)[-1].rstrip() for line in text.splitlines()]
     return "\n".join([line for line in lines if line][-LOG_LINES:])

@@ -2,8 +2,8 @@
 
     python -m benchmarks.gpu.publish_checkpoint RUN
 
-The model has no uncertainty head. `mtlnet ship --data` can fit one later, on other rounds and on
-any machine.
+The model has no uncertainty head. `mtlnet ship --data` can fit an uncertainty head later, on other
+rounds and on any machine.
 """
 
 import sys

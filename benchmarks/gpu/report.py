@@ -1,7 +1,7 @@
 """Stores the results of a GPU run: `gpu_run.json` in its work folder and in its output folder.
 
 The file is written after each stage, so that a stopped run keeps the results of its finished
-stages. If the run is started again with the same work folder, it continues after them.
+stages. If the run is started again with the same work folder, it continues with the next stage.
 """
 
 import csv
@@ -16,15 +16,18 @@ NAME = "gpu_run.json"
 FORMAT = 1
 MAX_CURVE_ROWS = 2_000
 MAX_BYTES = 16 * 2**20
-"""Largest size of the output folder."""
+"""Largest size of the output folder in bytes."""
 DONE, FAILED, STOPPED, SKIPPED, RUNNING = "done", "failed", "stopped", "skipped", "running"
 
 
 class Report:
-    """The results by stage. `work`: folder kept between runs; `out`: folder for the user."""
+    """The results of all stages, by the name of the stage. `work` is the folder that is kept
+    between runs, `out` the output folder for the user. `rehearsal`: whether the run is a
+    rehearsal."""
 
     def __init__(self, work: Path, out: Path, rehearsal: bool) -> None:
-        """Read the results in `work`. UserError if their format or `rehearsal` differs."""
+        """Read the results in `work`. Raises UserError if their format differs, or if they are of a
+        rehearsal and this run is not, or vice versa."""
         work.mkdir(parents=True, exist_ok=True)
         out.mkdir(parents=True, exist_ok=True)
         self.work, self.out = work, out
@@ -42,7 +45,7 @@ class Report:
         return bool(self.stage(stage).get("status") == DONE)
 
     def stage(self, name: str) -> dict[str, Any]:
-        """The result of a stage; {} before it ran."""
+        """Return the result of the stage `name`; {} before the stage has run."""
         found: dict[str, Any] = self.content["stages"].get(name, {})
         return found
 
@@ -59,7 +62,8 @@ class Report:
             write_json(folder / NAME, self.content)
 
     def copy_curves(self, curves: Path, name: str) -> None:
-        """Write every n-th row of `curves`, at most MAX_CURVE_ROWS, to the file `name` in `out`."""
+        """Write every n-th row of the CSV file `curves` to the file `name` in `out`. n is chosen so
+        that at most MAX_CURVE_ROWS rows are written."""
         if not curves.is_file():
             return
         with curves.open(encoding="utf-8", newline="") as file:

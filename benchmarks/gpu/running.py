@@ -33,8 +33,9 @@ def run_all(
 ) -> int:
     """Run all stages that are not done, and return the exit code.
 
-    `begin`: start of the run, by `time.monotonic()`. Raises UserError if `minutes` are too few or
-    too many, or if `work` has the results of another kind of run.
+    `begin`: start of the run, by `time.monotonic()`. `machine`: a result of `describe_machine`.
+    Raises UserError if `minutes` are too few or too many, or if `work` has the results of a
+    rehearsal and this run is not a rehearsal, or vice versa.
     """
     plan = Plan(minutes)
     report = Report(work, out, rehearse)
@@ -80,7 +81,7 @@ def run_stages(task: Run, functions: Stages = STAGE_FUNCTIONS) -> None:
 
 
 def finish(report: Report) -> int:
-    """Print status and duration of each stage; return the exit code."""
+    """Print the status and the duration of each stage; return the exit code of the run."""
     for name in STAGES:
         stage = report.stage(name)
         why = str(stage.get("why", "")).strip().splitlines()

@@ -30,17 +30,19 @@ from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.model_card import CARD
 
 MERGE_SHARE = 0.12
-"""Share of the time of `collect_train` for merging its parts."""
+"""Share of the time of the stage `collect_train` that is kept for merging its parts."""
 START_S = 12.0
-"""Seconds for imports and planning before a collection records, in a run of ten minutes."""
+"""Seconds that a collection needs for imports and planning before it records, in a run of ten
+minutes."""
 WHOLE_RUN = 150_000
-"""Steps of recipe `paper`."""
+"""Number of steps of a whole training with the recipe `paper`."""
 EVALUATED = {"test": "test", "unseen": "unseen", "random": "unseen"}
 """The split of each dataset that is evaluated."""
 
 
 class StageFailed(Exception):
-    """A stage did not finish; the argument is the reason. `found`: its results so far."""
+    """Raised if a stage did not finish. The argument `why` is the reason, `found` has the results
+    of the stage so far."""
 
     def __init__(self, why: str, found: dict[str, Any] | None = None) -> None:
         super().__init__(why)
@@ -49,7 +51,8 @@ class StageFailed(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """Settings and report of a run, for all stages; `begin`: its start, by `time.monotonic()`."""
+    """Settings and report of a run, for all stages. `begin` is the start of the run, by
+    `time.monotonic()`."""
 
     plan: Plan
     size: Size
@@ -66,7 +69,7 @@ class Run:
 
     @property
     def batch(self) -> int | None:
-        """Batch size of the training; None: the recipe's."""
+        """Batch size of the training; None: the batch size of the recipe."""
         return self.given_batch or self.size.batch
 
     @property
@@ -78,7 +81,8 @@ class Run:
         return self.until - time.monotonic()
 
     def command(self, name: str, *words: str, openmp_threads: int | None = None) -> Command:
-        """The command `python WORDS`; its output and log are `name`.out and .log in `work`."""
+        """Return the command `python WORDS`. Its output is `name`.out and its log `name`.log, both
+        in `work`."""
         threads = {} if openmp_threads is None else {"OMP_NUM_THREADS": str(openmp_threads)}
         out, log = self.work / f"{name}.out", self.work / f"{name}.log"
         return Command((sys.executable, *words), out, log, threads)
@@ -131,7 +135,8 @@ def gpu_tests(task: Run) -> dict[str, Any]:
 
 
 def collect_test(task: Run) -> dict[str, Any]:
-    """Collect the three datasets for evaluation; on a slow machine they get fewer rounds."""
+    """Collect the three datasets for evaluation until the deadline. On a slow machine they have
+    fewer rounds than planned."""
     collections = evaluation_collections(task.size, task.cores)
     commands = [each.command(task.work) for each in collections]
     ended = run(commands, task.left())
@@ -172,7 +177,8 @@ def time_fast(task: Run) -> dict[str, Any]:
 
 
 def time_paper(task: Run) -> dict[str, Any]:
-    """Train with recipe `paper` and return the time of its steps, of all 150,000 if they fit."""
+    """Train with recipe `paper` for `Size.timed_steps` steps, or fewer if the time ends. Return the
+    time of a step and the extrapolated time of all 150,000 steps."""
     return _time_recipe(task, "paper")
 
 
@@ -202,10 +208,10 @@ def _time_recipe(task: Run, recipe: str) -> dict[str, Any]:
 
 
 def timing(points: list[dict[str, float]]) -> dict[str, Any]:
-    """Steps, seconds and speed of a training from the rows of its curves; {} without rows.
+    """Return steps, seconds and speed of a training from the rows of its curves; {} without rows.
 
-    `step_ms`: median time of a step. `whole_run_s`: time of 150,000 steps at the mean speed of the
-    steps after the first row (ten steps, in which the GPU's code is compiled), in s.
+    `step_ms`: median time of a step. `whole_run_s`: time in s of 150,000 steps, extrapolated from
+    the steps after the first row, because the GPU's code is compiled in the ten steps before it.
     """
     if not points:
         return {}

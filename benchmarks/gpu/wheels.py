@@ -1,4 +1,5 @@
-"""Lists the packages that a GPU run needs, and downloads and installs wheels of missing ones."""
+"""Lists the packages that a GPU run needs, and downloads and installs the wheels of missing
+packages."""
 
 import importlib
 import re
@@ -18,13 +19,13 @@ PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux201
 
 
 def packages() -> dict[str, str]:
-    """The packages in `packages.toml`, by import name."""
+    """Return the names of the packages in `packages.toml`, by import name."""
     tables = tomllib.loads(PACKAGES.read_text(encoding="utf-8"))
     return {**tables["machine"], **tables["wheels"]}
 
 
 def missing_packages() -> list[str]:
-    """The packages of `packages.toml` that cannot be imported in this Python."""
+    """Return the packages of `packages.toml` that cannot be imported in this Python."""
     return [package for name, package in packages().items() if not _is_installed(name)]
 
 
@@ -36,7 +37,8 @@ def _is_installed(name: str) -> bool:
 
 
 def pinned() -> list[str]:
-    """The packages to download as wheels: `name==version`, versions from requirements.lock."""
+    """Return the packages to download as wheels, as `name==version` with the versions of
+    requirements.lock."""
     lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
     versions = dict(re.findall(r"^([\w.-]+)==([\w.]+)", lock, re.MULTILINE))
     wheels = tomllib.loads(PACKAGES.read_text(encoding="utf-8"))["wheels"]

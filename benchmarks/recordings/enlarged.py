@@ -1,7 +1,9 @@
-"""Makes a dataset of any size from a few collected rounds: each round repeats their frames.
+"""Makes a dataset of any size from a few collected rounds: each new round repeats the frames of the
+collected rounds.
 
-Collecting 120,000 frames takes minutes. To time reading and checking, only the number of frames and
-their bytes matter. Log times and state files are as in a real dataset.
+The reason is time: collecting 120,000 frames takes minutes. For measuring the time of reading and
+checking, only the number of frames and their bytes matter. Log times and state files are as in a
+collected dataset.
 """
 
 import hashlib
@@ -30,7 +32,7 @@ Steps = list[dict[str, bytes]]
 
 
 def collect(folder: Path, **options: object) -> dict[str, Any]:
-    """Run `datagen collect` with these options into `folder`; return its JSON result."""
+    """Run `datagen collect` with the options `options` into `folder`; return its JSON result."""
     command = [sys.executable, "-m", "datagen", "collect", "--json", "--out", str(folder)]
     for name, value in options.items():
         command += [f"--{name}", str(value)]
@@ -40,15 +42,17 @@ def collect(folder: Path, **options: object) -> dict[str, Any]:
 
 
 def collect_few(folder: Path, rounds: int, frames: int) -> Path:
-    """Collect a small training set (another scenery in every frame) into `folder`; return it."""
+    """Collect a small training set of `rounds` rounds with `frames` frames each into `folder`.
+    Every frame has another scenery. Return `folder`."""
     collect(folder, rounds=rounds, frames=frames, seed=11, stretch=1)
     return folder
 
 
 def enlarged_few(home: Path, rounds: int, frames: int) -> Path:
-    """Make a dataset of `rounds` x `frames` from four collected rounds of 150 frames.
+    """Make a dataset of `rounds` rounds with `frames` frames each, from four collected rounds of
+    150 frames.
 
-    Returns its folder, which is in `home`.
+    Returns the folder of the dataset, which is in `home`.
     """
     return enlarge(collect_few(home / "few", 4, 150), home / "data", rounds, frames)
 

@@ -1,9 +1,10 @@
-"""Compares a flying lap of the simulated car with one in the real TORCS, under one control law.
+"""Compares a flying lap of the simulated car with a flying lap in the real TORCS, both under the
+same control law.
 
-A recording is a CSV file in `drives/`: laps in TORCS under `controllers.laws.torcs_feedback`. The
-same law drives the simulator from the same start, with the recorded times of the control steps. The
-times matter with these high gains: TORCS sends its state every 20 to 22 ms, so its control steps
-take 40 to 66 ms.
+A recording is a CSV file in `drives/`. It contains laps in TORCS under the control law of
+`controllers.laws.torcs_feedback`. The same law drives the simulated car from the same start, with
+the recorded durations of the control steps. The durations matter because the gains of the law are
+high: TORCS sends its state every 20 to 22 ms, so its control steps take 40 to 66 ms.
 """
 
 import itertools
@@ -28,9 +29,10 @@ from trackfeatures import RoadClass, UserError
 TRACKS = ("forza", "g-track-3")
 FLYING_LAP = 2
 LIMITS = {"steps": 0.01, "score_per_step": 0.004, "mean_abs_d_m": 0.02, "max_abs_d_m": 0.15}
-"""Largest allowed differences of the two laps: relative for the steps, else absolute."""
+"""Largest allowed differences of the two laps: relative for the number of steps, absolute for all
+other figures."""
 EVEN_STEPS = PHYSICS_HZ // 20
-"""Physics steps in a control step of 50 ms."""
+"""Number of physics steps in a control step of 50 ms."""
 
 Rows = NDArray[Any]
 
@@ -49,7 +51,8 @@ class Lap:
 
 @dataclass(frozen=True)
 class Fit:
-    """A flying lap in the simulator (`here`) and one in TORCS on the same track."""
+    """A flying lap in the simulator (`here`) and a flying lap in TORCS (`torcs`) on the same
+    track."""
 
     track: str
     here: Lap
@@ -57,7 +60,8 @@ class Fit:
 
     @property
     def difference(self) -> dict[str, float]:
-        """The simulator's value minus TORCS's for each name in LIMITS; relative for the steps."""
+        """The value in the simulator minus the value in TORCS for each name in LIMITS. For the
+        number of steps the difference is relative."""
         apart = {name: getattr(self.here, name) - getattr(self.torcs, name) for name in LIMITS}
         return apart | {"steps": apart["steps"] / self.torcs.steps}
 
@@ -68,7 +72,8 @@ class Fit:
 
 
 def read_recording(path: Path) -> Rows:
-    """The rows of a drive in TORCS, as a structured array with the column names.
+    """Return the rows of a drive in TORCS from the CSV file `path`, as a structured array with the
+    names of the columns.
 
     Raises UserError if the file cannot be read.
     """
@@ -99,8 +104,8 @@ def compare(name: str, drives: Path, *, as_recorded: bool = True) -> Fit:
 def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
     """Drive from offset `start_d` (m) and return the state at each control step of the flying lap.
 
-    `holds`: numbers of physics steps of the control steps, repeated from the start when used up.
-    Raises UserError if the car leaves the track.
+    `holds`: number of physics steps of each control step. If the drive has more control steps, the
+    list is repeated from its start. Raises UserError if the car leaves the track.
     """
     law, states = StateFeedback(), []
     with World(road, frequency_hz=PHYSICS_HZ) as world:
@@ -121,7 +126,8 @@ def drive_laps(road: Road, start_d: float, holds: list[int]) -> list[CarState]:
 
 
 def figures(lap: Rows, half_width: float) -> Lap:
-    """Figures of a lap; its rows are control steps: d (m), th (rad, yaw minus tangent), v (m/s)."""
+    """Return the figures of a lap. A row of `lap` is a control step with d (m), th (rad, yaw minus
+    track tangent) and v (m/s). `half_width` is half of the track's width in m."""
     offset, speed = np.abs(lap["d"]), 3.6 * lap["v"]
     score = np.cos(lap["th"]) - np.abs(np.sin(lap["th"])) - offset / half_width
     return Lap(

@@ -1,6 +1,8 @@
-"""Runs malicious clients against a service: all attacks of the tests one after another, per minute.
+"""Runs malicious clients against a service. They make all attacks of the tests, one after another,
+once per minute.
 
-They have a loopback address of their own, so that the service can tell them from other clients.
+They have a loopback address of their own, so that the service can distinguish them from other
+clients.
 """
 
 import multiprocessing
@@ -26,7 +28,7 @@ FORK = multiprocessing.get_context("fork")
 def malicious_clients(port: int) -> Iterator[None]:
     """Attack the service at `port` of this machine while the context lasts.
 
-    The context begins with the first attack. Raises RuntimeError if none begins.
+    The context begins with the first attack. Raises RuntimeError if no attack begins.
     """
     begun = SPAWN.Event()
     process = SPAWN.Process(target=attack_in_turn, args=(port, begun))
@@ -41,8 +43,8 @@ def malicious_clients(port: int) -> Iterator[None]:
 
 
 def attack_in_turn(port: int, begun: Event) -> None:
-    """Repeat all attacks; set `begun` at the first. Each attack is a process: its end closes the
-    connections."""
+    """Repeat all attacks on the service at `port`; set `begun` at the first attack. Each attack has
+    a process of its own, whose end closes the connections of the attack."""
     target = Target(port, source=ADDRESS)
     while True:
         for attack in ATTACKS:
@@ -55,7 +57,8 @@ def attack_in_turn(port: int, begun: Event) -> None:
 
 
 def make_and_hold(attack: Attack, target: Target, parent: int) -> None:
-    """Make an attack and keep its connections open for a minute, or until the parent exits."""
+    """Make an attack and keep its connections open for a minute, or until the parent process (with
+    the id `parent`) exits."""
     exit_with_parent(parent)
     held = []
     with suppress(OSError, AssertionError):  # the service refused it, which is correct

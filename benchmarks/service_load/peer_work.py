@@ -1,4 +1,5 @@
-"""The work that each peer does for a request: engine, precision and answer are the service's."""
+"""The work that each peer does for a request, with the engine, the precision and the answer of our
+service."""
 
 import os
 from pathlib import Path
@@ -13,7 +14,7 @@ MODEL, WORKERS, PORT = "DRIVERVIEW_MODEL", "DRIVERVIEW_WORKERS", "DRIVERVIEW_POR
 
 
 class Work:
-    """Decodes a JPEG, runs the model of the folder in $DRIVERVIEW_MODEL and returns its answer."""
+    """Decodes a JPEG, runs the model in the folder $DRIVERVIEW_MODEL and returns the answer."""
 
     def __init__(self) -> None:
         self._engine = load_engine(Path(os.environ[MODEL]))
@@ -24,10 +25,10 @@ class Work:
 
 
 def workers() -> int:
-    """Number of worker processes, from $DRIVERVIEW_WORKERS."""
+    """Return the number of worker processes, from $DRIVERVIEW_WORKERS."""
     return int(os.environ[WORKERS])
 
 
 def port() -> int:
-    """Port of the server on 127.0.0.1, from $DRIVERVIEW_PORT."""
+    """Return the port of the server on 127.0.0.1, from $DRIVERVIEW_PORT."""
     return int(os.environ[PORT])

@@ -34,7 +34,7 @@ BODY = jpeg(picture())
 
 
 def request(path: str = "/features") -> bytes:
-    """The bytes of a POST request to `path` with a JPEG of the model's own camera."""
+    """Return the bytes of a POST request to `path` with a JPEG of the model's own camera."""
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/jpeg\r\n"
     return f"{head}Content-Length: {len(BODY)}\r\n\r\n".encode() + BODY
 
@@ -50,7 +50,8 @@ class ComparisonOptions:
     int8: Annotated[bool, Option("--int8", help="Serve the int8 graph of the run.")] = False
 
     def pythons(self) -> dict[str, Path]:
-        """Python interpreter by server: the service first, then the given ones in PEERS' order."""
+        """Return the Python interpreter of each server, by name: first of our service, then of the
+        given peers in the order of PEERS."""
         given = {name: getattr(self, name) for name in PEERS if getattr(self, name)}
         return {OURS: Path(sys.executable), **given}
 
@@ -90,10 +91,12 @@ def running(
     cores: set[int] | None = None,
     root: Path = ROOT,
 ) -> Iterator[int]:
-    """Start server `name`, wait until it answers, and yield its port; end it on exit.
+    """Start the server `name`, wait until it answers, and yield its port. The server is ended when
+    the context ends.
 
-    `cores`: the cores it runs on; `root`: its source tree. SIGTERM now ends this process with
-    SystemExit, so that the server is ended too. Raises RuntimeError if the server does not answer.
+    `cores`: the cores that the server runs on; `root`: its source tree. After this call SIGTERM
+    ends this process with SystemExit, so that the server is ended too. Raises RuntimeError if the
+    server does not answer.
     """
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -125,7 +128,8 @@ def running(
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End a server with SIGTERM, after END_S with SIGKILL, and kill all its descendants."""
+    """End a server with SIGTERM, or with SIGKILL if it still runs after END_S, and kill all its
+    descendants."""
     family = descendants(process.pid)
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
@@ -137,14 +141,16 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 
 
 def processor_s(pids: list[int]) -> float:
-    """Processor time in s that the processes with these ids have used so far, in all."""
+    """Return the processor time in s that the processes with the ids `pids` have used so far,
+    summed over them."""
     stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
     ticks = sum(int(fields[11]) + int(fields[12]) for fields in stats)
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def descendants(pid: int) -> list[int]:
-    """Ids of all descendants of a process. (Linux: of the children of its first thread.)"""
+    """Return the ids of all descendants of the process `pid`. (The children that threads other than
+    the first thread started are not found.)"""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:  # the process has ended
@@ -170,7 +176,8 @@ def _answers(port: int, process: "subprocess.Popen[bytes]") -> bool:
 
 @dataclass(frozen=True)
 class Load:
-    """Requests (N,): when each was due (s), its time (ms), its HTTP status (0: connection failed).
+    """The N requests of a load, as arrays (N,): the times (s) at which they were due, the times
+    (ms) that they took, and their HTTP status (0: the connection failed).
 
     `seconds`: duration of the load.
     """
@@ -181,11 +188,12 @@ class Load:
     seconds: float
 
     def per_second(self, status: int = 200) -> float:
-        """Answers with this status per second."""
+        """Return the number of answers with the status `status` per second."""
         return float((self.status == status).sum()) / self.seconds
 
     def percentile(self, percent: float, status: int = 200) -> float:
-        """Percentile of the times in ms of requests with this status; NaN if there are none."""
+        """Return a percentile of the times in ms of the requests with the status `status`; NaN if
+        there are no such requests."""
         times = self.time_ms[self.status == status]
         return float(np.percentile(times, percent)) if len(times) else float("nan")
 
@@ -194,7 +202,7 @@ class Loader:
     """The compiled load generator."""
 
     def __init__(self, folder: Path, cores: set[int] | None = None) -> None:
-        """Compile it into `folder`; `cores`: the cores it runs on."""
+        """Compile the load generator into `folder`. `cores`: the cores that it will run on."""
         self._program = folder / "load"
         self._request = folder / "request"
         self._request.write_bytes(request())
@@ -203,9 +211,10 @@ class Loader:
         subprocess.run(compiler, check=True)
 
     def run(self, port: int, connections: int, seconds: float, rate: float = 0.0) -> Load:
-        """Send requests for `seconds`, `rate` per second over all connections.
+        """Send requests for `seconds` over `connections` connections, `rate` requests per second in
+        total.
 
-        With rate 0 each connection sends its next request when it has received its answer.
+        With rate 0 each connection sends its next request when the last answer has arrived.
         """
         numbers = [str(port), str(connections), str(seconds), str(rate)]
         done = subprocess.run(

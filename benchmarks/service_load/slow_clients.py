@@ -1,4 +1,5 @@
-"""Clients that hold connections open: half never end their headers, half never end their body.
+"""Clients that hold connections open: half of them never end the headers of their request, the rest
+never end its body.
 
     python benchmarks/service_load/slow_clients.py PORT COUNT      # runs until it is killed
 
@@ -45,7 +46,8 @@ class Slow:
             self.leave(events, now)
 
     def hear(self, events: selectors.BaseSelector, now: float) -> None:
-        """Read and ignore what the server sends; leave if it has closed the connection."""
+        """Read and ignore the bytes that the server sends; leave if the server has closed the
+        connection."""
         assert self._socket is not None
         part = b""
         with suppress(OSError):
@@ -54,7 +56,7 @@ class Slow:
             self.leave(events, now)
 
     def leave(self, events: selectors.BaseSelector, now: float) -> None:
-        """Close the connection, to connect again after PAUSE_S."""
+        """Close the connection. The client connects again after PAUSE_S."""
         if self._socket is not None:
             with suppress(KeyError):
                 events.unregister(self._socket)

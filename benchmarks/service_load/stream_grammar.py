@@ -1,4 +1,5 @@
-"""Generates random byte streams of HTTP/1.1 and WebSocket clients by a grammar, valid and invalid.
+"""Generates random byte streams of HTTP/1.1 and WebSocket clients by a grammar. The streams are
+valid or invalid.
 
 Sources: RFC 9112 (messages, chunked coding), RFC 9110 (fields), RFC 6455 (handshakes, frames).
 """
@@ -57,7 +58,8 @@ PAYLOADS = (*CODES, b"{}", b'{"frame_id": 1}', b"[" * 300, b"\xff\xfe", b"x" * 1
 
 
 def message(rng: random.Random) -> bytes:
-    """A random HTTP/1.1 request or WebSocket handshake; each of its parts is usually valid."""
+    """Return a random HTTP/1.1 request or WebSocket handshake. Each of its parts is usually
+    valid."""
     method = METHODS[0] if rng.random() < 0.5 else rng.choice(METHODS)
     version = VERSIONS[0] if rng.random() < 0.8 else rng.choice(VERSIONS)
     fields, body = [(b"Host", mostly(rng, HOSTS))], b""
@@ -76,7 +78,8 @@ def message(rng: random.Random) -> bytes:
 
 
 def payload(rng: random.Random) -> tuple[list[tuple[bytes, bytes]], bytes]:
-    """A random body and its Content-Length or Transfer-Encoding fields, sometimes wrong."""
+    """Return the Content-Length or Transfer-Encoding fields of a random body, which are sometimes
+    wrong, and this body."""
     body = rng.choice(BODIES)
     length = (b"Content-Length", b"%d" % len(body) if rng.random() < 0.7 else rng.choice(SIZES))
     kind = rng.random()
@@ -87,7 +90,8 @@ def payload(rng: random.Random) -> tuple[list[tuple[bytes, bytes]], bytes]:
 
 
 def chunked(rng: random.Random, body: bytes) -> bytes:
-    """`body` in chunked transfer coding, with random sizes, extensions and trailers."""
+    """Return `body` in chunked transfer coding, with random chunk sizes, extensions and
+    trailers."""
     sent, at = b"", 0
     while at < len(body):
         part = body[at : at + rng.choice([1, 7, 500])]
@@ -102,7 +106,7 @@ def chunked(rng: random.Random, body: bytes) -> bytes:
 
 
 def handshake_fields(rng: random.Random) -> list[tuple[bytes, bytes]]:
-    """Header fields of a WebSocket handshake, usually valid and complete."""
+    """Return the header fields of a WebSocket handshake, usually valid and complete."""
     key = mostly(rng, (b"AAAAAAAAAAAAAAAAAAAAAA==", b"short", b"=" * 24, b"A" * 9000))
     fields = [
         (b"Connection", mostly(rng, (b"Upgrade", b"keep-alive, upgrade", b"close"))),
@@ -116,7 +120,7 @@ def handshake_fields(rng: random.Random) -> list[tuple[bytes, bytes]]:
 
 
 def frames(rng: random.Random) -> bytes:
-    """One to five random WebSocket frames, usually valid."""
+    """Return one to five random WebSocket frames, usually valid."""
     sent = b""
     for _ in range(rng.randrange(1, 6)):
         opcode = rng.choice([1, 2, 2, 0, 8, 9, 10, rng.randrange(16)])
@@ -132,10 +136,10 @@ def frames(rng: random.Random) -> bytes:
 
 
 def mostly(rng: random.Random, choices: tuple[bytes, ...]) -> bytes:
-    """The first choice with probability 0.8, else any of them."""
+    """Return the first of the `choices` with probability 0.8, else a random one of all choices."""
     return choices[0] if rng.random() < 0.8 else rng.choice(choices)
 
 
 def ending(rng: random.Random) -> bytes:
-    """A line end: CR LF, rarely an invalid one."""
+    """Return a line end: CR LF, or rarely an invalid line end."""
     return ENDS[0] if rng.random() < 0.99 else rng.choice(ENDS)

@@ -24,9 +24,10 @@ PICTURE = 32, 24
 def flood(
     sequence: Any, shared: Any, local: Any, shared_image: Any, local_image: Any, first: int
 ) -> int:
-    """Publish 5,000 messages and return the next number. All words of a message are its number.
+    """Publish 5,000 messages with the numbers from `first` on, and return the next number. All
+    words of a message contain its number.
 
-    A pause after each message gives the reader a chance to read it.
+    A pause after each message gives the reader a chance to read the message.
     """
     for number in range(first, first + 5000):
         local[1:] = number
@@ -41,7 +42,8 @@ def flood(
 def verify(
     sequence: Any, shared: Any, local: Any, shared_image: Any, local_image: Any, goal: int
 ) -> tuple[int, int, int]:
-    """Try 10^6 times to read a message, until `goal` are read; return (whole, torn, damaged)."""
+    """Try at most 10^6 times to read a message, until `goal` messages are read. Return the numbers
+    of whole, torn and damaged messages."""
     whole, torn, damaged, seen = 0, 0, 0, 0
     for _ in range(1_000_000):
         if whole + torn >= goal:
@@ -78,9 +80,10 @@ def write_states(name: str) -> None:
 
 
 def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -> dict[str, float]:
-    """Count the torn messages when numba code writes states with pictures and C reads them.
+    """Count the torn messages when numba code writes states with pictures and the C program
+    `hammer` reads them, until `messages` are read, for at most `patience_s` s.
 
-    `task` of the C program `hammer`: "read", or "racy" to read without the lock.
+    `task` of the C program: "read", or "racy" to read without the lock.
     """
     name = fresh_name()
     writer = start(sys.executable, str(LINK), "--flood", name)
@@ -100,12 +103,13 @@ def server_to_client(hammer: str, task: str, messages: int, patience_s: float) -
 
 
 def client_to_server(hammer: str, messages: int, patience_s: float) -> dict[str, float]:
-    """Count the torn messages when the C program `hammer` writes commands and numba reads them."""
+    """Count the torn messages when the C program `hammer` writes commands and numba code reads
+    them, until `messages` are read, for at most `patience_s` s."""
     name = fresh_name()
     segment = segment_for_flood(name, (0, 0))
     writer = start(hammer, "write", name)
     arrays = Receiver(segment, COMMAND)._buffer.arrays
-    verify(*arrays, 0)  # compiles it before the time is measured
+    verify(*arrays, 0)  # compiles the function before the time is measured
     whole, torn, damaged = 0, 0, 0
     began = time.monotonic()
     try:

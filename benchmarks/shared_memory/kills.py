@@ -1,4 +1,5 @@
-"""Kills one side of the link (SIGKILL), times the other side's reaction, finds left segments."""
+"""Kills one side of the link (SIGKILL), measures the time until the other side notices the kill,
+and looks for shared-memory segments that remain."""
 
 import random
 import signal
@@ -23,13 +24,14 @@ BOUND_S = 2.0
 
 
 class Killer:
-    """Kills one side of a running link at a random moment and times the other side's reaction."""
+    """Kills one side of a running link at a random moment, and measures the time until the other
+    side notices the kill."""
 
     def __init__(self, hammer: str, seed: int) -> None:
         self._hammer = hammer
         self._random = random.Random(seed)
         self._name, self._server = start_server()
-        self._next = start_server()  # starts while the first one is in use
+        self._next = start_server()  # the next server starts while the first server is in use
 
     def server_under_python(self) -> float:
         """Kill the server of a Python client; return the seconds until ServerDied is raised."""
@@ -70,7 +72,7 @@ class Killer:
             return time.monotonic() - killed
 
     def close(self) -> list[str]:
-        """Stop both servers; return the names of segments that remain."""
+        """Stop both servers; return the names of the shared-memory segments that remain."""
         for name, server in ((self._name, self._server), self._next):
             Link(name, wait_s=START_S).quit()
             server.communicate(timeout=START_S)

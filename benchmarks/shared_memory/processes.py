@@ -1,4 +1,5 @@
-"""Shared code of the link's benchmarks: the C program, servers as processes, segment names."""
+"""Code that the benchmarks of the link share: it compiles the C program, starts servers as
+processes and makes names of segments."""
 
 import subprocess
 import sys
@@ -12,7 +13,8 @@ from simulator.link.layout import Mode
 
 LINK = Path(__file__).parents[1] / "link.py"
 START_S = 180.0
-"""Time limit for a start; a server with an empty cache compiles its code first."""
+"""Time limit (s) for the start of a server. With an empty cache a server compiles its code
+first."""
 TRACK = "oval"
 INFO = ServerInfo("none", 1, 4.0, 1.0, 1.0, 1.0, 1.0, 0, 20, Mode.LOCK_STEP, 0, 0, 0, (0.0,) * 19)
 
