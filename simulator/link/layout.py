@@ -60,8 +60,7 @@ class Refusal(IntEnum):
 
 
 class Ended(IntEnum):
-    """Why the episode has ended (STATE.ended). The names are the names in
-    `simulator.env.reward.Ending`."""
+    """Why the episode has ended (STATE.ended); named as in `simulator.env.reward.Ending`."""
 
     NOT = 0
     OFF_TRACK = 1

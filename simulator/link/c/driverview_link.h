@@ -72,8 +72,7 @@ enum drvlink_refusal {
     DRVLINK_REFUSAL_BAD_CHECKSUM = 6,
 };
 
-/* Why the episode has ended (STATE.ended). The names are the names in
-    `simulator.env.reward.Ending`. */
+/* Why the episode has ended (STATE.ended); named as in `simulator.env.reward.Ending`. */
 enum drvlink_ended {
     DRVLINK_ENDED_NOT = 0,
     DRVLINK_ENDED_OFF_TRACK = 1,
