@@ -275,8 +275,8 @@ NoModel = Annotated[
     bool,
     typer.Option(
         "--no-model",
-        help="For a picture without a label, first show the markings of a car in the middle "
-        "of a lane instead of the model's answer.",
+        help="Run no model. The page then starts a picture without a label with the markings of "
+        "a lane of usual width with the car in its middle, instead of the model's answer.",
     ),
 ]
 LabelHost = Annotated[

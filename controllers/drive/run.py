@@ -150,8 +150,8 @@ def _real_time(
 
 
 def check_started(config: DriveConfig, result: DriveResult) -> None:
-    """Raise UserError if the car drove less than 5 m although its drive lasted 10 s or ended
-    early."""
+    """Raise UserError if the car drove less than 5 m in a drive that lasted at least 10 s, or that
+    an event (`result.ended`, for example a collision) ended, after any time."""
     seconds = result.steps / FREQUENCY_HZ
     if result.distance_m >= START_M or (result.ended is None and seconds < START_S):
         return

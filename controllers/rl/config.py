@@ -154,9 +154,9 @@ class TrainConfig:
     ] = None
     track: Annotated[
         str | None,
-        "Name of a track (`simulator tracks` lists the names), or its file. Only with "
-        "several cars also: all; then half of the cars drive on all tracks in turn, and "
-        "half of the cars on random roads. Default: forza with one car, otherwise all.",
+        "Name of a track (`simulator tracks` lists the names), or its file. With "
+        "several cars (--envs) also: all. Then half of the cars drive on all tracks in turn, "
+        "and the other half on random roads. Default: forza with one car, otherwise all.",
     ] = None
     seed: Annotated[int, Option(help="Seed of all random numbers of the training.", min=0)] = 0
     steps: Annotated[
@@ -171,8 +171,9 @@ class TrainConfig:
         str,
         "State that the actor receives. paper: offset, angle, speeds and class of the "
         "road. history: the paper's state, and its changes over the last seven steps. "
-        "stacked: the numbers of paper, the yaw rate, the changes of offset and angle, "
-        "and the last two actions. residual: the numbers of stacked and the steering of "
+        "stacked: the numbers of the state paper (the class as one number), the yaw rate, "
+        "the changes of offset and angle since the last step, and the last two actions. "
+        "residual: the numbers of the state stacked, and the steering of the controller "
         "lqr, to which the actor adds a correction. With several cars or ppo only paper "
         "and history are possible.",
     ] = "paper"

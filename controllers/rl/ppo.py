@@ -255,7 +255,10 @@ class Ppo:
         }
 
     def _next_values(self, values: Array) -> Array:
-        """Return the values (T, N) of the states after the steps; `values`: before the steps."""
+        """Return the critic's values (T, N) of the states after each of the T steps of N cars.
+
+        `values` (T, N): the critic's values of the states before each step.
+        """
         row = self._rollout
         found = np.empty_like(values)
         found[:-1] = values[1:]

@@ -90,7 +90,8 @@ def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
 
 def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:
     """Check a split and return its report. `tolerances` are the largest differences between
-    near-duplicates. `made` states whether this command created the split; the report contains it.
+    near-duplicates. `made` is true if the running command has just created the split, false if
+    the split existed before; it is copied to the report.
     Raises DatasetError if a round, seed or content hash is on two sides."""
     dataset = Dataset.open(folder, name)
     frames = dataset.select("all")

@@ -95,7 +95,9 @@ class TrainConfig:
     init: Annotated[
         str | None,
         Option(
-            help="Model to train further: as for `mtlnet evaluate --model`.",
+            help="Model to train further: the folder of a training, its name in runs/, "
+            '"latest" for the newest training, or a model that is shipped with the project: '
+            '"default" or "varied".',
             show_default="none: the weights are random at the start",
         ),
     ] = None

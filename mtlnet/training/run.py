@@ -133,7 +133,8 @@ def _train(
 def require_new(out: Path) -> None:
     """Raise UserError when the folder of a new run exists and is not empty.
 
-    A start that was killed can have left the folder empty, or with an unfinished `config.json`.
+    A folder that contains only an unfinished `config.json` is accepted like an empty folder. Both
+    can remain when a training is killed at its start.
     """
     empty = out.is_dir() and {*out.iterdir()} <= {unfinished_path(out / CONFIG)}
     if out.exists() and not empty:

@@ -53,8 +53,14 @@ _WHEELS_X, _WHEEL_RADIUS = (-1.35, 1.32), 0.33
 
 @dataclass(frozen=True)
 class CarMesh:
-    """Triangles of a car, vertices (3 T, 9) float32: position, normal, colour. The first `near`
-    vertices are the near level of detail; the vertices from `far` on are the far level."""
+    """Triangles of a car in two levels of detail.
+
+    `vertices` (3 T, 9) float32: three vertices for each of the T triangles of both levels, each
+    with position, normal and colour. The order is: detailed wheels, body, simple wheels. A near car
+    is drawn with the first `near` vertices (detailed wheels and body), a distant car with the
+    vertices from index `far` to the end (body and simple wheels). So both levels contain the body,
+    which lies between `far` and `near`.
+    """
 
     vertices: NDArray[np.float32]
     near: int
