@@ -24,7 +24,8 @@ def advantages_of(
 
     All arrays are (T, N). `values` are the critic's values of the states before the steps.
     `next_values` are its values of the states that the steps reached (at the end of an episode, not
-    of the first state of the next episode). `ended`: whether the step reached a terminal state, whose value is 0. `over`: whether the step was the last step
+    of the first state of the next episode). `ended`: whether the step reached a terminal state,
+    whose value is 0. `over`: whether the step was the last step
     of its episode, so that later steps do not count. `discounts`: discount factor of each step.
     `gae_lambda`: lambda of Schulman et al., 0 to 1.
     """

@@ -157,8 +157,8 @@ class _Placer:
         self.parts: list[FloatArray] = []
 
     def add(self, template: FloatArray, s: float, offset: float, clear_m: float) -> None:
-        """Add `template` (n, 12) at (`s`, `offset`) m to the candidates of `place`. If this position
-        is nearer than `clear_m` (m) to a wall line, `place` skips the candidate."""
+        """Add `template` (n, 12) at (`s`, `offset`) m to the candidates of `place`. If this
+        position is nearer than `clear_m` (m) to a wall line, `place` skips the candidate."""
         self.candidates.append((template, s, offset, clear_m))
 
     def place(self) -> None:
