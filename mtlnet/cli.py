@@ -155,7 +155,7 @@ def evaluate_command(
     copies: options.Copies = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
-    views: options.Views = 1,
+    views: command.Views = 1,
     as_json: command.AsJson = False,
 ) -> None:
     """Evaluate a model on a dataset: print its errors in m and rad.
@@ -205,7 +205,7 @@ def predict_command(
     topic: options.Topic = "",
     engine: options.EngineKind = "openvino",
     precision: options.Precision = None,
-    views: options.Views = 1,
+    views: command.Views = 1,
     as_json: command.AsJson = False,
 ) -> None:
     """Compute the track features of images, films, webcams, streams, rounds, Foxglove files or

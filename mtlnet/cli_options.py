@@ -32,15 +32,6 @@ Precision = Annotated[
         "`mtlnet export` and is reliable on this CPU, else bf16 if the CPU supports it, else f32",
     ),
 ]
-Views = Annotated[
-    int,
-    typer.Option(
-        help="Number of views of each image whose answers are averaged. 1: the image alone; "
-        "2: also its mirror image (errors about a tenth smaller than with 1); 6: also "
-        "both of these turned to the left and to the right. The time is proportional to "
-        "the number of views."
-    ),
-]
 
 # Options of `train`, beside the fields of TrainConfig.
 Heads = Annotated[

@@ -119,15 +119,6 @@ CameraFiles = Annotated[
         "model's camera only.",
     ),
 ]
-Views = Annotated[
-    int,
-    typer.Option(
-        help="Number of views of each image whose answers are averaged. 1: the image alone; "
-        "2: also its mirror image (errors about a tenth smaller than with 1); 6: also "
-        "both of these turned to the left and to the right. The time is proportional to "
-        "the number of views."
-    ),
-]
 LogAnswers = Annotated[
     bool,
     typer.Option(
@@ -153,7 +144,7 @@ def serve(
     trusted_proxy: TrustedProxy = None,
     body_mib: BodyMib = Limits.body_mib,
     camera: CameraFiles = None,
-    views: Views = 1,
+    views: command.Views = 1,
 ) -> None:
     """Serve a model over HTTP: clients send driver-view images and receive track features.
 

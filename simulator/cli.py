@@ -51,65 +51,76 @@ def centreline(
     typer.echo(f"{out}: {rows} rows", err=True)
 
 
+# Options of `snapshot`.
+LaneWidth = Annotated[
+    float | None,
+    typer.Option(
+        help="Width of the lanes, m, 2.7 to 4.5. Only with --roads paper. Default: 4.0; with "
+        "--roads varied it is random."
+    ),
+]
+Roads = Annotated[
+    str,
+    typer.Option(
+        help="Kind of the road. paper: lanes of --lane-width and the track's own lane "
+        "markings; varied: width of the lanes, shoulders, lane markings and surface "
+        "are random, determined by --seed."
+    ),
+]
+SnapshotSeed = Annotated[
+    int,
+    typer.Option(
+        help="Seed of the scenery, the details of the light and the positions of the car.",
+        min=0,
+    ),
+]
+SnapshotTraffic = Annotated[
+    int, typer.Option(help="Number of other cars ahead in each view.", min=0, max=12)
+]
+SnapshotLight = Annotated[
+    str | None,
+    typer.Option(
+        help="Light and weather in all views: clear, overcast, dusk, fog, heavy-shadow, rain "
+        "or snow. Default: every second view is in clear light, the remaining views are "
+        "in the other kinds of light in turn."
+    ),
+]
+View = Annotated[
+    str | None,
+    typer.Option(
+        help="Direction of all views: front, left, right, rear, chase (from behind the car) "
+        "or top (from above). Default: 14 views front, one chase and one top."
+    ),
+]
+ImageKind = Annotated[
+    str,
+    typer.Option(
+        help="Kind of the images: colour, depth (colours show distances) or class (colours "
+        "show kinds of objects)."
+    ),
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Camera file of driverview, OpenCV, ROS or Kalibr; the images are rendered "
+        "through its lens. Default: the camera of the shipped models."
+    ),
+]
+
+
 @app.command()
 def snapshot(
     track: TrackName,
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
     lanes: Lanes = 2,
-    lane_width: Annotated[
-        float | None,
-        typer.Option(
-            help="Width of the lanes, m, 2.7 to 4.5. Only with --roads paper. Default: 4.0; with "
-            "--roads varied it is random."
-        ),
-    ] = None,
-    roads: Annotated[
-        str,
-        typer.Option(
-            help="Kind of the road. paper: lanes of --lane-width and the track's own lane "
-            "markings; varied: width of the lanes, shoulders, lane markings and surface "
-            "are random, determined by --seed."
-        ),
-    ] = "paper",
-    seed: Annotated[
-        int,
-        typer.Option(
-            help="Seed of the scenery, the details of the light and the positions of the car.",
-            min=0,
-        ),
-    ] = 0,
-    traffic: Annotated[
-        int, typer.Option(help="Number of other cars ahead in each view.", min=0, max=12)
-    ] = 3,
-    light: Annotated[
-        str | None,
-        typer.Option(
-            help="Light and weather in all views: clear, overcast, dusk, fog, heavy-shadow, rain "
-            "or snow. Default: every second view is in clear light, the remaining views are "
-            "in the other kinds of light in turn."
-        ),
-    ] = None,
-    view: Annotated[
-        str | None,
-        typer.Option(
-            help="Direction of all views: front, left, right, rear, chase (from behind the car) "
-            "or top (from above). Default: 14 views front, one chase and one top."
-        ),
-    ] = None,
-    kind: Annotated[
-        str,
-        typer.Option(
-            help="Kind of the images: colour, depth (colours show distances) or class (colours "
-            "show kinds of objects)."
-        ),
-    ] = "colour",
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            help="Camera file of driverview, OpenCV, ROS or Kalibr; the images are rendered "
-            "through its lens. Default: the camera of the shipped models."
-        ),
-    ] = None,
+    lane_width: LaneWidth = None,
+    roads: Roads = "paper",
+    seed: SnapshotSeed = 0,
+    traffic: SnapshotTraffic = 3,
+    light: SnapshotLight = None,
+    view: View = None,
+    kind: ImageKind = "colour",
+    camera: CameraFile = None,
     tracks_dir: TracksDir = None,
 ) -> None:
     """Write a PNG file with 16 camera views along a track.

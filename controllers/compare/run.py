@@ -103,7 +103,7 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
         find_track(track, config.tracks_dir)
     check_light(config.light)
     for perception in dict.fromkeys(cell.perception for cell in todo):
-        check_perception(perception, config.model)
+        check_perception(perception, config.model, config.views)
     config.out.mkdir(parents=True, exist_ok=True)
     with locked_folder(config.out):
         return _drive_missing(config, todo, progress)

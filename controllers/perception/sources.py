@@ -187,13 +187,22 @@ def _require_finite(*values: float) -> None:
         raise ValueError(f"{values} are not all finite")
 
 
-def check_perception(name: str, model: str) -> None:
+def check_perception(name: str, model: str, views: int = 1) -> None:
     """Raise UserError for an unknown perception `name`, or if `name` is "model" and there is no run
-    `model`."""
+    `model`. Also raises UserError for a number `views` of averaged views other than 1, 2 or 6, and
+    for more than one view of the images that a service answers."""
+    from mtlnet.inference.view_average import check_count
+
+    check_count(views)
     if name == "model":
         from mtlnet.inference.model_card import resolve_run
 
         resolve_run(model)
+    elif ":" in name and views != 1:
+        raise UserError(
+            f"--views {views} is for --perception model; start the service at {name} with `serve "
+            f"--views {views}` instead"
+        )
     elif name != "truth" and ":" not in name:
         raise UserError(
             f"perception {name!r} is unknown; give truth, model, or the address of a "
@@ -219,7 +228,7 @@ def open_perception(
     `light` (e.g. "clear") and random scenery by `seed`. Raises UserError for another name, a
     missing model, or a service that does not answer.
     """
-    check_perception(name, model)
+    check_perception(name, model, views)
     if name == "truth":
         yield truth(lane_centre)
         return

@@ -10,10 +10,10 @@ standard deviation that does not depend on the state. Advantages are generalised
 - The discount factor of a step depends on the distance driven in it, not on its duration: a slow
   car needs more steps, but not more metres, to return to the middle of the road.
 - Advantages are divided by their typical size in the same state, which the critic's second output
-  learns. Without this division the start, where the car is slow and the advantages are small, would
-  have little weight, although most of the score is lost there. Then advantages are divided by their
-  mean absolute deviation, not by their standard deviation, and clipped at 4 times this deviation:
-  an early end costs hundreds of times as much as a usual step, and would outweigh all other steps.
+  learns. Without this the start, where the car is slow and the advantages are small, would have
+  little weight, although most of the score is lost there. Then advantages are divided by their mean
+  absolute deviation and clipped at 4 times this deviation, because an early end costs hundreds of
+  times as much as a usual step.
 - The critic also receives the exact state and the road ahead (`privileged`).
 - The standard deviation of the steering is at least 0.05.
 - The gradients of actor and critic are clipped separately; the value's loss is not clipped, and
@@ -49,8 +49,8 @@ ADVANTAGE_LIMIT = 4.0
 V_X_AT = privileged.PARTS.index("v_x") - privileged.SIZE
 """Index, counted from the end, of v_x in a state that is followed by its privileged state."""
 LEAST_STD = 0.05
-"""Least standard deviation of the steering actions. Without this limit the standard deviation falls
-to 0.02 within 1.5 million steps, and from then on the score does not improve."""
+"""Least standard deviation of the steering actions. Without it the standard deviation falls to 0.02
+within 1.5 million steps, and the score stops improving."""
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -255,10 +255,8 @@ class Ppo:
         }
 
     def _next_values(self, values: Array) -> Array:
-        """Return the critic's values (T, N) of the states after each of the T steps of N cars.
-
-        `values` (T, N): the critic's values of the states before each step.
-        """
+        """Return the critic's values (T, N) of the states after T steps of N cars. `values` (T, N)
+        are its values of the states before the steps."""
         row = self._rollout
         found = np.empty_like(values)
         found[:-1] = values[1:]
@@ -277,8 +275,8 @@ class Ppo:
         """Train the actor for all epochs; returns the means of its loss and of its KL divergence
         from the policy before the update.
 
-        `orders`: a random order for each epoch. `states` (B, size + 21). `targets` (B, 3): the
-        action, the logarithm of its density before the update, and its advantage.
+        `orders`: a random order for each epoch. `states` (B, size + 21). `targets` (B, 3): action,
+        logarithm of its density before the update, advantage.
         """
         policy, found = self.policy, []
         for batch, chosen in self._minibatches(orders, states, targets):
@@ -296,9 +294,7 @@ class Ppo:
     def _improve_critic(self, orders: list[Tensor], states: Tensor, wanted: Tensor) -> float:
         """Train the critic for all epochs; returns the mean loss of its values.
 
-        Arguments as for `_improve_actor`, but `wanted` (B, 2): the return, and the logarithm of the
-        absolute value of the advantage.
-        """
+        `wanted` (B, 2): the return, and the logarithm of the absolute value of the advantage."""
         losses = []
         for batch, targets in self._minibatches(orders, states, wanted):
             value, size = 0.5 * ((self.policy.critic(batch) - targets) ** 2).mean(dim=0)

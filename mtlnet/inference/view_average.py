@@ -5,6 +5,7 @@ right. The errors of the answers for different views are only partly correlated,
 smaller errors (docs/experiments/views.md). The model runs once for each view.
 """
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -36,13 +37,18 @@ _FROM = [FEATURES.index(_SWAP.get(name, name)) for name in FEATURES]
 _MARKINGS_FROM = _FROM[: len(tf.MARKINGS)]
 
 
+def check_count(count: int) -> None:
+    """Raise UserError unless `count` is a number of views that can be averaged: 1, 2 or 6."""
+    if count not in COUNTS:
+        raise UserError(f"--views {count}: give {COUNTS[0]}, {COUNTS[1]} or {COUNTS[2]}")
+
+
 class Views:
     """Makes `count` views of the images of a camera. Raises UserError for another count than 1, 2
     or 6."""
 
     def __init__(self, count: int, camera: CameraParameters) -> None:
-        if count not in COUNTS:
-            raise UserError(f"--views {count}: give {COUNTS[0]}, {COUNTS[1]} or {COUNTS[2]}")
+        check_count(count)
         self.count = count
         self._camera = camera
 
@@ -59,13 +65,9 @@ class Views:
         """Homographies (3, 3) of the turned views."""
         if self.count < COUNTS[-1]:
             return []
-        lens, mount = self._camera.intrinsics(), self._camera.rotation()
-        turns = []
-        for angle in (TURN_RAD, -TURN_RAD):
-            sine, cosine = np.sin(angle), np.cos(angle)
-            yaw = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-            turns.append(lens @ mount @ yaw @ mount.T @ np.linalg.inv(lens))
-        return turns
+        camera, degrees = self._camera, np.degrees(TURN_RAD)
+        yaws = (camera.yaw_deg - degrees, camera.yaw_deg + degrees)
+        return [camera.homography(replace(camera, yaw_deg=float(yaw))) for yaw in yaws]
 
     def _turn(self, image: Image, homography: NDArray[np.float64]) -> Image:
         import cv2  # imported here: engines of one view, and `--help`, do not need OpenCV
