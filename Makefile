@@ -10,6 +10,7 @@ endif
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+SETUP_GB := 9
 PACKAGES := trackfeatures runtime simulator datagen mtlnet serve controllers
 # Without compiled Python files every process compiles what it imports, which takes half of a command's time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -26,10 +27,12 @@ setup: $(READY) ## make .venv with everything in it (about 8 GB, minutes)
 # The lock pins every version; torch and torchvision come together, from one index. Python compiles
 # what it imports: of 21,000 modules a seventh, so that pip need not take a minute to compile all.
 $(READY): pyproject.toml requirements.lock
-	@$(MAKE) --no-print-directory system
 	@"$(PYTHON)" -c 'import sys, venv, ensurepip; sys.exit(not $(SUPPORTED))' 2>/dev/null || \
 	  { echo "error: Python 3.11, 3.12, 3.13 or 3.14 with venv is needed, found: $$("$(or $(PYTHON),python3)" --version 2>&1 | head -n 1); install one" \
 	  "(python3-venv on Debian), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
+	@[ -d $(VENV) ] || "$(PYTHON)" -c 'import shutil, sys; free = shutil.disk_usage(".").free; \
+	  sys.exit(free < $(SETUP_GB) * 1e9 and f"error: .venv needs $(SETUP_GB) GB, but this disk has only {free / 1e9:.1f} GB free; nothing was installed")'
+	@$(MAKE) --no-print-directory system
 	@"$(PYTHON)" -c '$(DESCRIBE_PYTHON)'
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV); }
 	$(BIN)/python -m pip install --quiet --no-compile --require-hashes --requirement requirements.lock

@@ -60,6 +60,15 @@ def test_a_python_without_venv_is_passed_over(tmp_path: Path) -> None:
     assert done.stdout == "chosen=python3.13\n"
 
 
+def test_setup_refuses_a_disk_without_room_before_it_installs_anything(tmp_path: Path) -> None:
+    put_python(tmp_path, "python3.11", (3, 11))
+    environment = tmp_path / "environment"
+    done = made(tmp_path, f"VENV={environment}", "SETUP_GB=1000000", "setup")
+    assert done.returncode != 0
+    assert re.search(r"^error: \.venv needs 1000000 GB, but this disk has only ", done.stderr)
+    assert not environment.exists()
+
+
 def test_the_lock_pins_one_version_of_each_package_for_every_python() -> None:
     """Only packages without wheels for a version are left out of it."""
     pins = re.findall(
