@@ -172,12 +172,36 @@ def locked_folder(folder: Path) -> Iterator[None]:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         if not try_lock(descriptor):
-            raise UserError(
-                f"another process is writing to {folder}; wait until it ends, or give another --out"
-            )
+            raise _locked(folder)
         yield
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def locked_file(path: Path) -> Iterator[None]:
+    """Like `locked_folder` for a file, which need not exist and may be replaced meanwhile.
+
+    The lock is held on the file `.NAME.lock` in the same folder, which is removed at the end.
+    """
+    lock = path.with_name(f".{path.name}.lock")
+    descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        # The process that held the lock may have removed this file after it was opened here.
+        if not try_lock(descriptor) or os.fstat(descriptor).st_nlink == 0:
+            raise _locked(path)
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)
+
+
+def _locked(path: Path) -> UserError:
+    return UserError(
+        f"another process is writing to {path}; wait until it ends, or give another --out"
+    )
 
 
 def fsync_path(path: Path) -> None:

@@ -22,7 +22,7 @@ from controllers.drive.disturbance import find_disturbance
 from controllers.drive.many import drive_many
 from controllers.drive.run import GRID_SHARE
 from controllers.registry import CONTROLLERS
-from runtime.files import check_folder, write_json
+from runtime.files import check_folder, locked_file, write_json
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
 
@@ -30,8 +30,8 @@ VERSION = 1
 EXPLORED = 1.0 / 3.0
 """Share of the candidates that are random over the whole ranges."""
 SETTINGS = ("tracks", "reward", "steps", "disturbance", "seed", "budget")
-"""Settings that are stored in the file of a search. A search with other settings refuses this
-file."""
+"""Settings that are stored in the file of a search, together with the hash of each road. A search
+with other settings or roads refuses this file."""
 
 Progress = Callable[[int, int, str], None]
 """A function that is called with the number of candidates done, the total number of candidates, and
@@ -44,7 +44,8 @@ def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]
 
     The content is {"version", "settings", "controllers"}. For each controller it has the parameters
     and the reward per step of the best candidate, and all candidates that were tried. Raises
-    UserError for an unknown name, or for a file of a search with other settings.
+    UserError for an unknown name, for a file of a search with other settings or roads, or for a
+    file that another process is writing.
     """
     controllers = names(config.controllers, "controllers")
     for controller in controllers:
@@ -58,6 +59,13 @@ def tune(config: TuneConfig, progress: Progress | None = None) -> dict[str, Any]
     for track in names(config.tracks, "tracks"):
         find_track(track, config.tracks_dir)
     check_folder(config.out)
+    with locked_file(config.out):
+        return _search(config, controllers, progress)
+
+
+def _search(
+    config: TuneConfig, controllers: list[str], progress: Progress | None
+) -> dict[str, Any]:
     content = _read(config.out, config)
     total = config.budget * len(controllers)
     for number, controller in enumerate(controllers):
@@ -133,7 +141,10 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
 
 
 def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
-    settings = {name: getattr(config, name) for name in SETTINGS}
+    settings: dict[str, Any] = {name: getattr(config, name) for name in SETTINGS}
+    settings["roads"] = [
+        find_track(name, config.tracks_dir).content_hash for name in names(config.tracks, "tracks")
+    ]
     if not path.exists():
         return {"version": VERSION, "settings": settings, "controllers": {}}
     try:

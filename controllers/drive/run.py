@@ -92,17 +92,13 @@ def drive(
     road = Road(track, lanes=config.lanes)
     lane = choose_lane(config, road)
     steps = steps_for(config.steps, track.name, track.length_m)
-    noisy = config.perception != "truth"
-    # Answers to images are predicted to the present, so they have no delay for the controller. A
-    # disturbance can add a delay that the controller does not know.
-    delay_s = 0.0 if noisy and disturbance is None else None
-    loop = LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy, delay_s=delay_s)
+    disturbance = disturbance or Disturbance()
+    loop = control_loop(config, disturbance)
     if parameters is None:
         parameters = read_parameters(config.parameters, config.controller)
     controller = make_controller(config.controller, loop, parameters)
     pedals = choose_pedals(config, road, lane)
     with ExitStack() as stack:
-        disturbance = disturbance or Disturbance()
         world = stack.enter_context(
             disturbance.world(
                 road, traffic=config.traffic, frequency_hz=FREQUENCY_HZ, seed=config.seed
@@ -124,10 +120,21 @@ def drive(
             steps,
             pedals=pedals,
             lane_centre=lane.centre,
-            noisy=noisy,
+            noisy=loop.noisy,
             record=_recorder(perceive, watching, steps, progress),
         )
         return result if live is None else replace(result, real_time=live.figures())
+
+
+def control_loop(config: DriveConfig, disturbance: Disturbance) -> LoopConfig:
+    """Return the properties of the control loop of a drive, for its controller.
+
+    Answers to images are predicted to the present, so they have no delay for the controller. A
+    disturbance can add a delay that the controller does not know.
+    """
+    noisy = config.perception != "truth"
+    known = noisy and disturbance == Disturbance()
+    return LoopConfig(1.0 / FREQUENCY_HZ, noisy=noisy, delay_s=0.0 if known else None)
 
 
 def _check_film(path: Path) -> None:

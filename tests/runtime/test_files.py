@@ -13,6 +13,7 @@ from runtime.files import (
     atomic_write,
     check_folder,
     file_hash,
+    locked_file,
     locked_folder,
     replaced_files,
     try_lock,
@@ -131,6 +132,20 @@ def test_a_locked_folder_is_refused_to_others_until_the_context_ends(tmp_path: P
             pass
     with locked_folder(tmp_path):
         pass
+
+
+def test_a_locked_file_is_refused_to_others_and_leaves_no_lock(tmp_path: Path) -> None:
+    path = tmp_path / "tuned.json"
+    with locked_file(path):
+        other = pytest.raises(UserError, match="another process is writing to .*tuned.json")
+        with other, locked_file(path):
+            pass
+        path.write_text("{}")
+        with locked_file(tmp_path / "other.json"):
+            pass
+    with pytest.raises(KeyboardInterrupt), locked_file(path):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_hash_of_a_file_is_sha_256(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The search for parameters of controllers."""
 
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from controllers.compare.tune import evaluate, propose, tune
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.run import drive, read_parameters
-from simulator.track.catalogue import find_track
+from simulator.track.catalogue import OWN_TRACKS, find_track
 from trackfeatures import UserError
 
 
@@ -45,6 +46,36 @@ def test_the_search_finds_better_parameters_and_is_continued(
         assert read_parameters(config.out, name) == found["parameters"]
     with pytest.raises(UserError, match="other settings"):
         tune(replace(config, seed=1))
+
+
+def test_a_track_file_that_was_edited_needs_another_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("controllers.compare.tune.evaluate", lambda *_: 1.0)
+    track = tmp_path / "mine.toml"
+    config = TuneConfig(
+        out=tmp_path / "t.json", controllers="lqr", tracks="mine", budget=1, tracks_dir=tmp_path
+    )
+    shutil.copy(OWN_TRACKS / "oval.toml", track)
+    tune(config)
+    shutil.copy(OWN_TRACKS / "town.toml", track)
+    with pytest.raises(UserError, match="other settings"):
+        tune(config)
+
+
+def test_two_searches_do_not_write_the_same_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TuneConfig(out=tmp_path / "t.json", controllers="lqr", tracks="oval", budget=1)
+
+    def evaluate(*_: object) -> float:
+        with pytest.raises(UserError, match="another process is writing to"):
+            tune(replace(config, controllers="mpc"))
+        return 1.0
+
+    monkeypatch.setattr("controllers.compare.tune.evaluate", evaluate)
+    tune(config)
+    assert [path.name for path in tmp_path.iterdir()] == ["t.json"]
 
 
 def test_the_reward_of_a_candidate_is_the_mean_of_single_drives() -> None:

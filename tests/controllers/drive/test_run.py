@@ -19,7 +19,8 @@ from controllers.drive.closed_loop import (
     throttle_and_brake,
 )
 from controllers.drive.config import DriveConfig
-from controllers.drive.run import choose_lane, drive, steps_for
+from controllers.drive.disturbance import DISTURBANCES, Disturbance
+from controllers.drive.run import choose_lane, control_loop, drive, steps_for
 from controllers.interface import Observation
 from controllers.laws.lqr import WEIGHTS_BRIEFLY_TRAINED, LqrPreview
 from controllers.perception.perceived import Perceive, Perceived
@@ -270,3 +271,19 @@ def test_the_result_is_written_as_json() -> None:
     assert set(named.split()) <= set(content)
     assert content["speed_kmh"] == [pytest.approx(36.0)] * 2
     assert content["cruising_kmh"] is None
+
+
+@pytest.mark.parametrize(
+    ("perception", "disturbance", "delay_s"),
+    [
+        ("model", Disturbance(), 0.0),
+        ("model", DISTURBANCES["none"], 0.0),  # the drives of `controllers compare`
+        ("model", DISTURBANCES["delay"], None),
+        ("truth", Disturbance(), None),
+    ],
+)
+def test_the_controller_knows_the_delay_of_images_without_disturbance(
+    perception: str, disturbance: Disturbance, delay_s: float | None
+) -> None:
+    loop = control_loop(DriveConfig(perception=perception), disturbance)
+    assert (loop.noisy, loop.delay_s) == (perception != "truth", delay_s)
