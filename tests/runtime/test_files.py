@@ -137,7 +137,7 @@ def test_a_locked_folder_is_refused_to_others_until_the_context_ends(tmp_path: P
 def test_a_locked_file_is_refused_to_others_and_leaves_no_lock(tmp_path: Path) -> None:
     path = tmp_path / "tuned.json"
     with locked_file(path):
-        other = pytest.raises(UserError, match="another process is writing to .*tuned.json")
+        other = pytest.raises(UserError, match=r"another process is writing to .*tuned\.json")
         with other, locked_file(path):
             pass
         path.write_text("{}")
