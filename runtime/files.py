@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -73,6 +73,12 @@ def check_folder(path: Path) -> None:
         raise UserError(f"{path} is a folder; give the name of a file in it")
     if not path.parent.is_dir():
         raise UserError(f"there is no folder {path.parent} to write {path.name} to; make it first")
+
+
+def require_other_file(path: Path, inputs: Iterable[Path], option: str = "--out") -> None:
+    """Raise UserError if the output `path`, given as `option`, is one of the files to read."""
+    if path.is_file() and any(path.samefile(source) for source in inputs if source.exists()):
+        raise UserError(f"{option} {path} is a file to read; give another one")
 
 
 def atomic_write(path: Path, content: str | bytes, *, fsync: bool = False) -> None:

@@ -9,6 +9,7 @@ file is made again only if its controller, tuned parameters, road or model has c
 import hashlib
 import json
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib import import_module
@@ -106,7 +107,11 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
         check_perception(perception, config.model, config.views)
     config.out.mkdir(parents=True, exist_ok=True)
     with locked_folder(config.out):
-        return _drive_missing(config, todo, progress)
+        try:
+            return _drive_missing(config, todo, progress)
+        finally:
+            with suppress(OSError):  # a folder with files stays
+                config.out.rmdir()
 
 
 def _drive_missing(

@@ -46,10 +46,10 @@ CARS = 64
 of a step."""
 FREE = (
     *("controller", "parameters", "track", "tracks_dir", "lanes", "steps", "start_d"),
-    *("target_lane", "seed", "model", "light"),
+    *("target_lane", "seed", "model", "views", "light"),
 )
-"""Options of a drive with exact states that may differ from their defaults. The model and the light
-are allowed, because they have no effect on exact states."""
+"""Options of a drive with exact states that may differ from their defaults. The model, its views
+and the light are allowed, because they have no effect on exact states."""
 STEPS_BETWEEN_REPORTS = 50
 LOOP = LoopConfig(1.0 / FREQUENCY_HZ)
 PHYSICS_STEPS = PHYSICS_HZ // FREQUENCY_HZ

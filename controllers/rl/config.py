@@ -249,11 +249,16 @@ def resolve(config: TrainConfig) -> TrainConfig:
     """Return `config` with the number of cars, the track, the steps and the steps between
     evaluations; a missing value gets the default for one car or for several cars.
 
-    Raises UserError if `image_errors` is set for a training with one car.
+    Raises UserError if `image_errors` or `disturbed` is set for a training with one car.
     """
     many = config.vectorised
-    if config.image_errors and not many:
-        raise UserError("--image-errors needs several cars; give --envs or --algorithm ppo")
+    several = {
+        "--image-errors": config.image_errors,
+        "--disturbed": config.disturbed not in (0.0, TrainConfig().disturbed),
+    }
+    for option, given in several.items():
+        if given and not many:
+            raise UserError(f"{option} needs several cars; give --envs or --algorithm ppo")
     defaults: dict[str, Any] = {
         "envs": 256 if many else 1,
         "track": ALL_TRACKS if many else "forza",

@@ -74,8 +74,8 @@ ShardOf = Annotated[
     str,
     typer.Option(
         help="Part of the plan to record, as NUMBER/COUNT, for example 2/4 for the second of four "
-        "parts. Each part is recorded into its own folder, and `datagen merge` joins the "
-        "folders. Default: the whole plan."
+        "parts. The parts may be recorded into one shared folder, or into folders of their own, "
+        "which `datagen merge` joins. Default: the whole plan."
     ),
 ]
 ExecutorName = Annotated[

@@ -165,7 +165,7 @@ def view(
         sys.stdout.flush()  # with --web this process continues to run
 
     config = ShowConfig(html, save, web, port)
-    config.validate()
+    config.validate(recorded)
     contents = Contents.open(recorded)
     show(contents, config, on_shown)
 

@@ -1,5 +1,6 @@
 """Merges dataset folders: shards of one plan, or plans that share no round id and no seed."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -129,8 +130,8 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
     """Return the common plan of `plans` if they are equal, otherwise a plan of all their rounds.
     `folders` are the folders of the plans, for error messages.
 
-    Raises DatasetError if different plans share a round id or a seed. With a shared seed, the same
-    road in the same scenery could be in training and in test.
+    Raises DatasetError if different plans have different cameras or share a round id or a seed.
+    With a shared seed, the same road in the same scenery could be in training and in test.
     """
     parts = {plan["hash"]: plan for plan in plans}
     if len(parts) == 1:
@@ -151,6 +152,7 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
                 f"{name} {value}; merge shards that were started with the same options, or collect "
                 f"one of the datasets with another {option}"
             )
+    _require_one_camera(plans, folders)
     drivers = {tuple(plan["driver"].values()) for plan in parts.values() if "driver" in plan}
     joined = {"driver": {"drivers": "; ".join(", ".join(d) for d in sorted(drivers))}}
     return {
@@ -163,10 +165,28 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
     }
 
 
+def _require_one_camera(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> None:
+    """Raise DatasetError if the rounds of two folders were planned with different cameras."""
+    holders: dict[str, Path] = {}
+    for plan, folder in zip(plans, folders, strict=True):
+        for entry in plan["rounds"]:
+            holders.setdefault(json.dumps(entry["nominal_camera"], sort_keys=True), folder)
+    if len(holders) > 1:
+        (one, folder), (other, another) = list(holders.items())[:2]
+        raise DatasetError(
+            f"{folder} and {another} have different cameras, {one} and {other}; keep them apart"
+        )
+
+
 def _copy_round(folder: Path, state: RoundState, out: Path) -> None:
     partial = partial_path(out, state.id)
     try:
-        shutil.copyfile(folder / state.file, partial)
+        try:
+            shutil.copyfile(folder / state.file, partial)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                error.filename = str(partial)  # shutil names the source first
+            raise
         if file_hash(partial) != state.sha256:
             raise DatasetError(
                 f"{folder / state.file} is damaged (its SHA-256 differs from the recorded one); "

@@ -65,9 +65,13 @@ def export(folder: Path, out: Path, config: ExportConfig, progress: Progress) ->
     dataset = Dataset.open(folder)
     parts = sides(dataset, config.split)
     with new_folder(out) as partial:
-        _write(partial, dataset, parts, config, progress)
-        about = _card(dataset, parts, config.format, config.shard_size)
-        (partial / "README.md").write_text(about, encoding="utf-8")
+        try:
+            _write(partial, dataset, parts, config, progress)
+            about = _card(dataset, parts, config.format, config.shard_size)
+            (partial / "README.md").write_text(about, encoding="utf-8")
+        except OSError as error:
+            error.filename = error.filename or str(out)  # a failed write names no file
+            raise
         written = [path for path in partial.rglob("*") if path.is_file()]
         size = sum(path.stat().st_size for path in written)
     return ExportResult(

@@ -24,6 +24,8 @@ rendering about 15 frames."""
 SEEDS_PER_PLAN = 1_000_000
 MAX_ROUNDS = SEEDS_PER_PLAN // 2
 """Largest number of rounds of a plan; the seeds of more rounds would overlap with another plan."""
+MAX_SEED = 10**12
+"""Largest seed of a plan: the seeds of its rounds are below 2^63, the limit of random roads."""
 
 
 def all_lights() -> tuple[str, ...]:
@@ -44,7 +46,7 @@ class TrackChoice:
 
 Rounds = Annotated[int, Option(help="Number of rounds (recorded drives).")]
 Frames = Annotated[int, Option(help="Number of frames in each round.")]
-Seed = Annotated[int, Option(help="Seed of all random choices, 0 or more.")]
+Seed = Annotated[int, Option(help="Seed of all random choices, 0 to 10^12.")]
 TestShare = Annotated[
     float,
     Option(
@@ -163,8 +165,8 @@ class CollectConfig:
                 f"{self.scenes} scenes a round asked for, but the scenery never changes; give "
                 "--stretch too, the number of frames until it does"
             )
-        if self.seed < 0:
-            raise UserError(f"the seed is {self.seed}; give a whole number from 0 up")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise UserError(f"the seed is {self.seed}; give a whole number from 0 to {MAX_SEED}")
         if self.jitter_camera and self.camera.matrix is not None:
             raise UserError(
                 "--jitter-camera varies the field of view, which the camera file's matrix fixes; "

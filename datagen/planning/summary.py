@@ -71,11 +71,20 @@ def listing(plan: Plan) -> RenderableType:
 
 
 def _notes_on_rare_classes(classes: dict[str, dict[str, float]]) -> list[str]:
-    return [
-        f"note: {name} will be {share:.0%} of all frames; other --tracks or more rounds give more"
-        for name, share in classes["all"].items()
-        if share < MIN_SHARE
-    ]
+    """Return a line for each class whose forecast share is too small on a side of the split."""
+    notes = []
+    for name in classes["all"]:
+        rare = [
+            f"{shares[name]:.0%} of the {side} frames"
+            for side, shares in classes.items()
+            if side != "all" and shares[name] < MIN_SHARE
+        ]
+        if rare:
+            notes.append(
+                f"note: {name} will be {' and '.join(rare)}; other --tracks or more rounds give "
+                "more"
+            )
+    return notes
 
 
 def _sides(plan: Plan) -> dict[str, list[RoundPlan]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from datagen.view.contents import Contents
-from runtime.files import atomic_write, check_folder, utf8_path
+from runtime.files import atomic_write, check_folder, require_other_file, utf8_path
 from trackfeatures.errors import UserError
 
 OnShown = Callable[[str], None]
@@ -27,13 +27,14 @@ class ShowConfig:
     web: bool
     port: int
 
-    def validate(self) -> None:
-        """Raise UserError for impossible options; called before the round is read."""
+    def validate(self, recorded: Path) -> None:
+        """Raise UserError for impossible options; called before the round `recorded` is read."""
         if sum((self.html is not None, self.save is not None, self.web)) > 1:
             raise UserError("--html, --save and --web exclude each other; give one of them")
-        for path in (self.html, self.save):
+        for option, path in (("--html", self.html), ("--save", self.save)):
             if path is not None:
                 check_folder(path)
+                require_other_file(path, [recorded], option)
         if self.html is not None:
             return
         _require_rerun()

@@ -72,10 +72,11 @@ class Drive:
 
     def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return the start of an episode: the start in the car's own options, overridden by the
-        options `given` to `reset`. Ranges stay ranges. Raises UserError for an unknown option, a
-        value that is not a number, or a start off the road. The last check is left out if the
-        episode's road is random."""
-        start = {**self._options.start, **given}
+        options `given` to `reset` that are not None. Ranges stay ranges. Raises UserError for an
+        unknown option, a value that is not a number, or a start off the road. The last check is
+        left out if the episode's road is random."""
+        own = {name: value for name, value in given.items() if value is not None}
+        start = {**self._options.start, **own}
         ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
         for end in (0, 1):
             values = {name: ranges[name][end] if name in ranges else start[name] for name in start}

@@ -28,7 +28,8 @@ class StableBaselinesCars(VecEnv):
         super().__init__(count, self.cars.single_observation_space, self.cars.single_action_space)
 
     def reset(self) -> Any:
-        starts = {name: [own.get(name) for own in self._options] for name in self._options[0]}
+        names = dict.fromkeys(name for own in self._options for name in own)
+        starts = {name: [own.get(name) for own in self._options] for name in names}
         observations, _ = self.cars.reset(seed=self._seeds, options=starts)
         self._reset_seeds()
         self._reset_options()

@@ -144,7 +144,8 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode of each car, or of the cars in the mask `options["reset_mask"]` (N,)
-        bool; returns the observations and infos of all cars. The options "s", "to_middle", "angle"
+        bool; returns the observations of all cars, and infos that contain only the cars that were
+        reset, as their masks say. The options "s", "to_middle", "angle"
         and "speed" are a number, a list with one value for each car, or a range
         (least, greatest)."""
         if self.closed:
@@ -155,6 +156,8 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         for number in np.flatnonzero(chosen).tolist():
             with naming_car(number, self.num_envs):
                 self._cars.drives[number].check(starts[number])
+        if isinstance(seed, int):
+            self._np_random, self._np_random_seed = seeding.np_random(seed)
         if not self._rngs:
             self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
         for number in np.flatnonzero(chosen).tolist():

@@ -185,6 +185,13 @@ def test_a_drive_on_a_track_that_has_changed_is_driven_again(tmp_path: Path) -> 
     assert len(codes) == 2
 
 
+def test_a_refused_comparison_leaves_no_folder(tmp_path: Path) -> None:
+    config = short(tmp_path, tracks="oval", start_d=50.0)
+    with pytest.raises(UserError, match="50"):
+        compare(config)
+    assert not config.out.exists()
+
+
 def test_two_comparisons_do_not_write_to_one_folder(tmp_path: Path) -> None:
     config = short(tmp_path, tracks="oval")
     config.out.mkdir()

@@ -118,7 +118,7 @@ def test_steering_beyond_the_lock_by_a_rounding_is_clipped(tmp_path: Path) -> No
     ],
 )  # fmt: skip
 def test_other_drives_are_driven_alone(options: dict[str, Any]) -> None:
-    assert can_join(task("lqr")[0])
+    assert can_join(task("lqr", views=2)[0])
     assert not can_join(task("lqr", **options)[0])
 
 

@@ -161,11 +161,13 @@ def test_numbers_out_of_range_are_refused(words: tuple[str, ...]) -> None:
     assert words[0] in done.stderr
 
 
-def test_errors_of_images_need_several_cars(tmp_path: Path) -> None:
+def test_errors_of_images_and_disturbances_need_several_cars(tmp_path: Path) -> None:
     out = tmp_path / "run"
     done = typed("controllers", "train", "--image-errors", "--out", out)
     assert error_line(done).startswith("error: --image-errors needs several cars; give --envs")
     assert not out.exists()
+    done = typed("controllers", "train", "--disturbed", "0.9", "--out", out)
+    assert error_line(done).startswith("error: --disturbed needs several cars; give --envs")
     train(short(out, image_errors=True))
     assert json.loads((out / "config.json").read_text())["image_errors"]
 

@@ -205,7 +205,7 @@ def test_a_dry_run_prints_the_plan_and_touches_nothing(tmp_path: Path) -> None:
     assert min(plan["expected_classes"]["all"].values()) >= 0.15
     assert list(tmp_path.iterdir()) == []
     oval = datagen_here("collect", "--tracks", "oval", "--dry-run").stdout
-    assert "note: right will be 0% of all frames" in oval
+    assert "note: right will be 0% of the train frames and 0% of the test frames" in oval
 
 
 def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_own(

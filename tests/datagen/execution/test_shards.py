@@ -1,5 +1,6 @@
 """Several collectors on one plan: parallel shards, locks, and merging of folders."""
 
+import errno
 import json
 import shutil
 import subprocess
@@ -22,6 +23,7 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
 from datagen.recording.integrity.verify import verify
 from tests.datagen.commands import datagen_here, make_small_plan
+from trackfeatures.camera import CameraParameters
 
 ROUNDS = ["--rounds", "3", "--frames", "20", "--tracks", "oval", "--workers", "1"]
 
@@ -112,6 +114,30 @@ def test_collections_of_another_prefix_and_seed_are_one_plan(tmp_path: Path) -> 
         merge(folders[:1], tmp_path / "both")
     with pytest.raises(tf.UserError, match="prefix of the rounds' names"):
         CollectConfig(prefix="../a", tracks=tracks)
+
+
+def test_merge_refuses_other_cameras_and_copies_nothing(tmp_path: Path) -> None:
+    for seed, camera in ((1, CameraParameters()), (2, CameraParameters(fov_y_deg=50.0))):
+        config = CollectConfig(
+            2, 3, seed=seed, prefix=str(seed), tracks=choose_tracks(("oval",), None), camera=camera
+        )
+        prepare(tmp_path / str(seed))
+        (tmp_path / str(seed) / "plan.json").write_text(json.dumps(make_plan(config).as_json()))
+    with pytest.raises(DatasetError, match=r"/1 and .*/2 have different cameras"):
+        merge([tmp_path / "1", tmp_path / "2"], tmp_path / "both")
+    assert not (tmp_path / "both").exists()
+
+
+def test_merge_on_a_full_disk_names_the_file_that_it_writes(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def copyfile(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(source), None, str(target))
+
+    monkeypatch.setattr("shutil.copyfile", copyfile)
+    with pytest.raises(OSError, match="No space left") as caught:
+        merge([whole], tmp_path / "out")
+    assert str(caught.value.filename).startswith(str(tmp_path / "out"))
 
 
 def test_merge_refuses_folders_of_other_plans_and_damaged_rounds(

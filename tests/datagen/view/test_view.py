@@ -93,6 +93,13 @@ def test_the_page_holds_images_markings_and_series_in_step(
     assert len(data["lines"][0]) == 20
 
 
+@pytest.mark.parametrize("option", ["--html", "--save"])
+def test_the_recording_is_not_overwritten(option: str, recorded: Path, refused: Refused) -> None:
+    before = recorded.read_bytes()
+    assert "is a file to read" in refused("view", recorded, option, recorded)
+    assert recorded.read_bytes() == before
+
+
 def test_a_long_round_is_subsampled_in_images_not_in_plots(recorded: Path) -> None:
     text = page(Contents.open(recorded), max_frames=10)
     data = read_page(text)

@@ -38,6 +38,17 @@ def test_the_adapter_gives_the_numbers_of_the_vector() -> None:
     vector.close()
 
 
+def test_options_of_some_cars_leave_the_start_of_the_others() -> None:
+    from simulator.env.stable_baselines import StableBaselinesCars
+
+    adapter = StableBaselinesCars(3, track="oval", start={"speed": 10.0})
+    adapter.set_options([{}, {"speed": 5.0}, {"to_middle": 1.0}])
+    adapter.reset()
+    speeds = [adapter.cars.world(number).state.vx for number in range(3)]
+    assert speeds == pytest.approx([10.0, 5.0, 10.0])
+    adapter.close()
+
+
 @pytest.mark.slow
 def test_ppo_learns_to_keep_the_road_in_20_000_steps(tmp_path: Path) -> None:
     done = subprocess.run(
