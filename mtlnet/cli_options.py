@@ -191,7 +191,8 @@ WorstSheet = Annotated[
 EveryFrame = Annotated[
     int,
     typer.Option(
-        help="Step between two evaluated frames: 1 evaluates all frames, 5 every fifth frame."
+        help="Step between two evaluated frames or pictures: 1 evaluates all, 5 every fifth. All "
+        "--copies of an evaluated picture are evaluated."
     ),
 ]
 Copies = Annotated[

@@ -71,10 +71,6 @@ class CustomImages:
             hashes=tuple(self.hashes[i] for i in chosen),
         )
 
-    def every(self, count: int) -> "CustomImages":
-        """Return every `count`-th picture, from the first on."""
-        return self.take(slice(None, None, count))
-
     def read_batch(
         self, indices: NDArray[np.int64], out: NDArray[np.uint8] | None = None
     ) -> NDArray[np.uint8]:
@@ -122,19 +118,21 @@ def open_custom_images(
     camera: CameraParameters,
     copies: Sequence[str] = (PLAIN,),
     *,
+    every: int = 1,
     skip_refused: bool = False,
 ) -> CustomImages:
     """Read the labels and pictures of a folder, and make the `copies` of each picture (kinds of
     `mtlnet.data.picture_copies.COPIES`) as seen by `camera`.
 
-    `camera`: the model's camera. Raises UserError with the line of `labels.csv` for a faulty row,
-    for a picture that is missing, damaged or not of its camera's aspect ratio, and for a picture
-    that shows too little of the model's view. With `skip_refused`, pictures that show too little of
-    the model's view are listed in `refused` instead; the error is raised only if no other picture
-    is left.
+    `camera`: the model's camera. `every`: read every n-th picture only, from the first on, with all
+    its copies. Raises UserError with the line of `labels.csv` for a faulty row, for a picture that
+    is missing, damaged or not of its camera's aspect ratio, and for a picture that shows too little
+    of the model's view. With `skip_refused`, pictures that show too little of the model's view are
+    listed in `refused` instead; the error is raised only if no other picture is left.
     """
     path = folder / LABELS
     pictures, labels = read_labels(path)
+    pictures, labels = pictures[::every], labels.take(slice(None, None, every))
     cameras = picture_cameras(folder, pictures, camera)
     digest = hashlib.sha256(path.read_bytes())
     for name in sorted({*_camera_files(folder, pictures)}):

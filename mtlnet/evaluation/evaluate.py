@@ -99,14 +99,15 @@ def evaluate_custom_images(
     (`mtlnet.evaluation.pictures`).
 
     `report(done, total)` is called with numbers of pictures. `every`: evaluate every n-th picture
-    only. `copies`: kinds of copies of each picture to evaluate, from
+    only, with its copies. `copies`: kinds of copies of each picture to evaluate, from
     `mtlnet.data.picture_copies.COPIES`. `page`: an HTML file to write. For pictures that show too
     little of the model's view, the report has the number but no errors. Raises UserError for faulty
     files.
     """
     engine = engines[0]
-    images = open_custom_images(folder, engine.card.camera, copies, skip_refused=True)
-    images = images.every(every)
+    images = open_custom_images(
+        folder, engine.card.camera, copies, every=every, skip_refused=True
+    )
     trained = engine.card.data.get("pictures", ())
     answers = judge(images, predict_frames(engines, images, report), trained)
     found = {

@@ -263,6 +263,25 @@ def test_refused_pictures_are_listed_where_they_are_counted(tmp_path: Path) -> N
     assert len(found.hashes) == len(found.pictures) == len(found.lenses) == len(found) == 4
 
 
+def test_every_nth_picture_is_read_with_all_its_copies(tmp_path: Path) -> None:
+    """Pictures 0, 2, 4 and 6 are of a camera that shows too little of the model's view."""
+    for name in "abcdefgh":
+        picture(tmp_path / f"{name}.png", 640, 360)
+    (tmp_path / "narrow.yaml").write_text("{width: 640, height: 360, fov_y_deg: 4}\n")
+    (tmp_path / "wide.yaml").write_text("{width: 640, height: 360}\n")
+    cameras = dict(zip("abcdefgh", ("narrow", "wide") * 4, strict=True))
+    rows = [f"{GOOD.replace('a.png', f'{k}.png')},{v}.yaml" for k, v in cameras.items()]
+    write(tmp_path, *rows, head=HEAD + ",camera")
+    (tmp_path / "b.png").write_bytes(b"damaged, and not read")
+    found = open_custom_images(tmp_path, CameraParameters(), COPIES, every=3, skip_refused=True)
+    assert [(p.file, copy) for p, copy, _ in found.refused] == [
+        (file, copy) for file in ("a.png", "g.png") for copy in COPIES
+    ]
+    assert [p.file for p in found.pictures] == ["d.png"] * len(COPIES)
+    assert found.copies == COPIES
+    assert len(found.labels) == len(found) == len(COPIES)
+
+
 def test_copies_show_what_their_labels_say(tmp_path: Path) -> None:
     """A painted point of the road lies in each copy at the place that the copy's camera and label
     give."""

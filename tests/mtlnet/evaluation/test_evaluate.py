@@ -1,9 +1,12 @@
-"""Evaluation of a model on a dataset: checks before the first frame."""
+"""Evaluation of a model on a dataset or on pictures: checks before the first frame, counts."""
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from mtlnet.data.picture_copies import COPIES
 from mtlnet.evaluation.evaluate import evaluate
 from mtlnet.inference.engine import load_engine
 from trackfeatures.errors import UserError
@@ -24,3 +27,31 @@ def test_a_file_that_cannot_be_written_is_an_error_before_the_first_frame(
             **{option: tmp_path / "file" / "out.html"},  # type: ignore[arg-type]
         )
     assert done == []
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Eight labelled pictures; the camera of every second shows too little of the model's view."""
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    lines = ["file,ml,mr,l,m,r,angle,heading,camera"]
+    for number in range(8):
+        camera = ("wide", "narrow")[number % 2]
+        lines.append(f"{number}.png,-1.5,2.0,,,,0.02,straight,{camera}.yaml")
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((210, 280, 3), 90, np.uint8))
+    (folder / "labels.csv").write_text("\n".join(lines) + "\n")
+    (folder / "wide.yaml").write_text("{width: 280, height: 210}\n")
+    (folder / "narrow.yaml").write_text("{width: 280, height: 210, fov_y_deg: 4}\n")
+    return folder
+
+
+@pytest.mark.parametrize(("every", "files", "refused"), [(1, 8, 4), (3, 3, 1), (4, 2, 0)])
+def test_every_nth_picture_is_counted_with_all_its_copies(
+    published: Path, pictures: Path, every: int, files: int, refused: int
+) -> None:
+    engine = load_engine(published, precision="f32")
+    found = evaluate([engine], pictures, "test", every=every, copies="mirrored,turned")["pictures"]
+    assert (found["files"], found["cases"], found["refused"]) == (files, 4 * files, 4 * refused)
+    assert {name: (part["cases"], part["refused"]) for name, part in found["by_copy"].items()} == {
+        name: (files, refused) for name in COPIES
+    }
