@@ -1,4 +1,5 @@
-"""Makes copies of a labelled picture for evaluation: mirrored, or rotated about the vertical axis.
+"""Makes copies of a labelled picture for evaluation: mirrored, or with the car rotated about the
+vertical axis through the camera.
 
 A few drives contain few angles and offsets, so a constant answer scores well on them. Copies widen
 the range of angles and offsets. Mirroring is exact. A rotation about the camera's optical centre is
@@ -68,26 +69,32 @@ def copied_picture(
         return image
     if copy == MIRRORED:
         return np.ascontiguousarray(image[:, ::-1])
-    return _turned(image, camera.resized(image.shape[1], image.shape[0]), TURNS_RAD[copy])
+    camera = camera.resized(image.shape[1], image.shape[0])
+    return _turned(image, camera, turned_camera(camera, copy))
 
 
-def _turned(image: NDArray[np.uint8], camera: CameraParameters, right: float) -> NDArray[np.uint8]:
-    """Return the picture after rotating the camera to its right by `right` (rad) about its vertical
-    axis."""
-    cosine, sine = np.cos(right), np.sin(right)
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # new to old directions
+def turned_camera(camera: CameraParameters, copy: str) -> CameraParameters:
+    """Return the camera of the rotated copy `copy` (a key of `TURNS_RAD`), in the frame of the car
+    before its rotation about the vertical axis."""
+    return replace(camera, yaw_deg=camera.yaw_deg - float(np.degrees(TURNS_RAD[copy])))
+
+
+def _turned(
+    image: NDArray[np.uint8], camera: CameraParameters, turned: CameraParameters
+) -> NDArray[np.uint8]:
+    """Return the picture of the camera `turned`, made from the picture of `camera`, which is at the
+    same position."""
     size = (camera.width, camera.height)
     grey = (BORDER_LEVEL,) * 3
     if camera.distortion == "none":
-        k = camera.intrinsics()
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        way = k @ turn @ np.linalg.inv(k)
+        way = turned.homography(camera)
         found = cv2.warpPerspective(image, way, size, flags=flags, borderValue=grey)
         return found.astype(np.uint8, copy=False)
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    seen = camera.rays(np.column_stack([columns.ravel(), rows.ravel()])) @ turn.T
+    rays = turned.rays(np.column_stack([columns.ravel(), rows.ravel()]))
     at_place = replace(camera, x=0.0, y=0.0, z=0.0)
-    maps = at_place.project(seen @ at_place.rotation()).reshape(*columns.shape, 2)
+    maps = at_place.project(rays @ turned.rotation()).reshape(*columns.shape, 2)
     across, down = (np.nan_to_num(maps[..., i], nan=-1e4).astype(np.float32) for i in (0, 1))
     found = cv2.remap(image, across, down, cv2.INTER_LINEAR, borderValue=grey)
     return found.astype(np.uint8, copy=False)
