@@ -49,7 +49,7 @@ def evaluation_table(result: dict[str, Any]) -> Table:
     """Make the table of a model's errors on active labels, and of the errors of a baseline that
     always answers the training mean."""
     title = f"{result['model']} on {result['frames']} {result['split']} frames of {result['data']}"
-    table = Table(title=escape(printable(title)))
+    table = Table(title=escape(printable(title + _views(result))))
     for column in ("", "mean", "median", "95 %", "99 %", "training mean", "ratio"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=not column)
     for name, title in TITLES.items():
@@ -65,7 +65,7 @@ def protocol_table(result: dict[str, Any]) -> Table:
     """Make the table of the paper's protocol, with the paper's figures in brackets; it fits in 80
     columns."""
     title = f"{result['model']} by the paper's protocol (in brackets: the paper)"
-    table = Table(title=escape(printable(title)))
+    table = Table(title=escape(printable(title + _views(result))))
     table.add_column("")
     for column in ("frames", "distance (m)", "angle (rad)", "class"):
         table.add_column(column, justify="right", no_wrap=True)
@@ -79,6 +79,12 @@ def protocol_table(result: dict[str, Any]) -> Table:
         cells = (f"{own} ({stated})" if stated else own for own, stated in figures)
         table.add_row(name, str(row["frames"]), *cells)
     return table
+
+
+def _views(result: dict[str, Any]) -> str:
+    """Return a text about the number of views of each image; empty if it is 1."""
+    count = result.get("views", 1)
+    return f", answers averaged over {count} views of each image" if count > 1 else ""
 
 
 def _percent(stated: float | None) -> str:
@@ -106,7 +112,7 @@ def picture_table(result: dict[str, Any]) -> Table:
     figures = result["pictures"]
     title = (
         f"{figures['cases']} pictures: {figures['refused']} refused, {figures['absent']} absent, "
-        f"{figures['out_of_distribution'] or 0} out of distribution"
+        f"{figures['out_of_distribution'] or 0} out of distribution{_views(result)}"
     )
     table = Table(title=title, box=None, padding=(0, 0, 0, 1))
     for column in ("", "pictures", "left (m)", "right", "width", "centre", "heading (rad)"):

@@ -41,6 +41,8 @@ from trackfeatures.errors import UserError
 
 PICTURE = "worst.jpg"
 CHECK_IMAGES = 4
+SHOWN = {"split", "frames", "rounds", "engine", "precision", "errors", "presence", *GROUPS}
+"""Keys of an evaluation that the page shows."""
 
 
 def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]:
@@ -152,6 +154,7 @@ def write_page(
         notes=notes.strip(),
         gate=int8.get("gate") if int8.get("model_hash") == card.model_hash else None,
         evaluations=found,
+        averaged=any(one.get("views", 1) > 1 for one in found),
         picture=PICTURE if picture is not None else "",
         groups=GROUPS,
         number=format_number,
@@ -168,6 +171,13 @@ def _read_evaluation(path: Path, card: ModelCard) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if found["model_hash"] != card.model_hash:
             raise UserError(f"{path} evaluates {found['model']}, other weights than these")
+        if "pictures" in found:
+            raise UserError(
+                f"{path} evaluates pictures of your own; the page shows evaluations on recorded "
+                "rounds: give the output of `mtlnet evaluate --json` for a dataset"
+            )
+        if missing := SHOWN - found.keys():
+            raise KeyError(min(missing))
         return found
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no result of `mtlnet evaluate --json` ({error!r})") from error

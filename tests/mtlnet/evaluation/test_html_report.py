@@ -25,6 +25,7 @@ from mtlnet.evaluation.html_report import (
     write_worst_sheet,
 )
 from mtlnet.evaluation.metrics import evaluate_by_groups, signed_errors
+from mtlnet.evaluation.tables import evaluation_table, protocol_table
 from mtlnet.inference.overlay import PREDICTION_COLOUR, TRUTH_COLOUR, marking_line, to_pixels
 from mtlnet.inference.prediction import FEATURES
 from tests.mtlnet.conftest import HIGH_CAMERA, HIGH_ROUNDS, write_dataset
@@ -224,3 +225,18 @@ def test_the_sheet_of_worst_frames_shows_each_above_its_caption(
         assert np.abs(image - expected).mean() < 8
         caption = sheet[top + height : top + tile, left : left + width]
         assert 0.005 < (caption < 128).mean() < 0.3
+
+
+def test_page_and_tables_state_several_views(
+    report: dict[str, Any], frames: Frames, outputs: NDArray[np.float32]
+) -> None:
+    text = "answers averaged over 2 views of each image"
+    single = page({**report, "views": 1}, frames, outputs)
+    assert single == page(report, frames, outputs)  # as of an evaluation before there were views
+    assert text not in single
+    several = {**report, "views": 2}
+    assert page(several, frames, outputs) == single.replace(", f32<br>", f", f32, {text}<br>")
+    assert str(evaluation_table(several).title) == f"{evaluation_table(report).title}, {text}"
+    protocol = {**several, "protocol": {}}
+    assert str(protocol_table(protocol).title).endswith(text)
+    assert text not in str(protocol_table({**protocol, "views": 1}).title)

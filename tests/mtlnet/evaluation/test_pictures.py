@@ -13,6 +13,7 @@ from mtlnet.data.custom_images import CustomImages, open_custom_images
 from mtlnet.data.picture_copies import parse_copies
 from mtlnet.evaluation.picture_page import cases, write_picture_page
 from mtlnet.evaluation.pictures import Answers, judge, picture_report
+from mtlnet.evaluation.tables import picture_table
 from tests.mtlnet.page import Page
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -118,6 +119,11 @@ def test_the_page_shows_each_picture_failures_first(images: CustomImages, tmp_pa
     assert page.rows(0)[1][1:] == ["0.050", "0.150", "0.200", "0.050", "0.0083"]
     assert "trained on some of these pictures" in page.source
     assert page.rows(1)[2] == ["answered absent: the lane is labelled", "1", "33.3%"]
+    several = {**report, "views": 6}
+    write_picture_page(path, several, answers)
+    text = "answers averaged over 6 views of each image"
+    assert path.read_text(encoding="utf-8") == page.source.replace("f32<br>", f"f32, {text}<br>")
+    assert f"{picture_table(report).title}, {text}" == picture_table(several).title
 
 
 def test_copies_are_named() -> None:

@@ -12,6 +12,7 @@ import torch
 from datagen.recording import Dataset
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.evaluation.evaluate import evaluate
+from mtlnet.evaluation.metrics import GROUPS
 from mtlnet.export.convert import write_export
 from mtlnet.export.int8 import gate
 from mtlnet.export.ship import half, ship_model, write_page
@@ -178,9 +179,33 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     file.write_text(json.dumps({**found, "model_hash": "0" * 64}))
     with pytest.raises(UserError, match="other weights than these"):
         write_page(shipped, [file])
-    file.write_text("[]")
-    with pytest.raises(UserError, match="no result of"):
+    for content in ("[]", json.dumps({"model_hash": engine.card.model_hash})):
+        file.write_text(content)
+        with pytest.raises(UserError, match="no result of"):
+            write_page(shipped, [file])
+    file.write_text(json.dumps({**found, "pictures": {"cases": 3}}))
+    with pytest.raises(UserError, match=r"test\.json evaluates pictures of your own; the page shows"):
         write_page(shipped, [file])
+
+
+def test_the_page_states_the_number_of_views(shipped: Path, dataset: Path, tmp_path: Path) -> None:
+    found = evaluate([load_engine(shipped, "openvino", "f32", views=2)], dataset, "test", every=8)
+    single, double = tmp_path / "1.json", tmp_path / "2.json"
+    double.write_text(json.dumps(found))
+    single.write_text(json.dumps({**found, "views": 1}))
+    page = write_page(shipped, [single, double]).read_text()
+    heading = "## Test rounds: 3 frames of 1 rounds, openvino f32"
+    assert [line for line in page.splitlines() if line.startswith("## Test")] == [
+        heading,
+        f"{heading}, 2 views",
+    ]
+    assert "The number of views is stated if" in page
+    assert "views" not in write_page(shipped, [single]).read_text()
+    for part in (found, *(part for name in GROUPS for part in found[name].values())):
+        del part["uncertainty"]  # as of a model without standard deviations
+    single.write_text(json.dumps(found))
+    assert write_page(shipped, [single]).read_text().count("| `ml` (m) |") == 1
+    (shipped / "README.md").unlink()
 
 
 def test_the_card_of_a_shipped_model_names_no_folder(published: Path, shipped: Path) -> None:
