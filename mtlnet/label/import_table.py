@@ -9,6 +9,7 @@ ignored. The cameras are pinholes.
 """
 
 import csv
+import filecmp
 import math
 import shutil
 from collections.abc import Sequence
@@ -69,39 +70,66 @@ def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> d
 
     A file gets the standard deviations of the last entry of `stds` whose pattern matches its name.
     Returns a dict: `folder`, and the numbers of `pictures` and `cameras`. Raises UserError for a
-    faulty row, and if `folder` has labels already.
+    faulty row, if `folder` has labels already, and if a picture would replace another file; then
+    nothing is written. A picture that is already in `folder` is not copied.
     """
     if (folder / LABELS).exists():
         raise UserError(f"{folder / LABELS} exists; give a new folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    cameras: dict[CameraParameters, str] = {}
-    rows: list[Cells] = []
+    found: list[tuple[CameraParameters, Cells]] = []
     for line, row in _rows(table):
         try:
             camera, cells = _converted(table.parent, row, stds)
             check_cells(cells)
+            _require_free(table.parent / row["file"], folder / row["file"])
         except (UserError, ValueError) as error:
             raise UserError(f"{table}, line {line}: {error}") from None
+        found.append((camera, cells))
+    cameras: dict[CameraParameters, str] = {}
+    for camera, cells in found:
+        source, target = table.parent / cells["file"], folder / cells["file"]
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
         if camera not in cameras:
-            cameras[camera] = _write_camera(folder, camera, {*cameras.values()})
-        rows.append({**cells, "camera": cameras[camera]})
-        target = folder / row["file"]
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(table.parent / row["file"], target)
-    write_cells(folder / LABELS, rows)
-    return {"folder": str(folder), "pictures": len(rows), "cameras": len(cameras)}
+            cameras[camera] = _write_camera(folder, camera)
+        cells["camera"] = cameras[camera]
+    write_cells(folder / LABELS, [cells for _, cells in found])
+    return {"folder": str(folder), "pictures": len(found), "cameras": len(cameras)}
+
+
+def _require_free(source: Path, target: Path) -> None:
+    """Raise UserError if `target` is a file with other contents than `source`."""
+    if target.exists() and not filecmp.cmp(source, target, shallow=False):
+        raise UserError(f"{target} exists and is another file; give a new folder")
 
 
 def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
-    with table.open(newline="", encoding="utf-8-sig") as file:
+    """Read the table; returns, for each row, the line number and the cells by column. Raises
+    UserError for a faulty header, a faulty row and a repeated file.
+
+    Bytes that are not UTF-8 become surrogates, as in file names.
+    """
+    lines: dict[str, int] = {}
+    rows: list[tuple[int, dict[str, str]]] = []
+    with table.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
         reader = csv.DictReader(file, strict=True)
-        names = reader.fieldnames or ()
-        missing = [name for name in NEEDED if name not in names]
-        if missing:
-            raise UserError(
-                f"{table} has no column {', '.join(missing)}; it must have {', '.join(NEEDED)}"
-            )
-        rows = [(reader.line_num, row) for row in reader]
+        try:
+            names = reader.fieldnames or ()
+            missing = [name for name in NEEDED if name not in names]
+            if missing:
+                raise UserError(
+                    f"{table} has no column {', '.join(missing)}; it must have {', '.join(NEEDED)}"
+                )
+            for row in reader:
+                where = f"{table}, line {reader.line_num}"
+                if None in row or None in row.values():
+                    raise UserError(f"{where}: it has not {len(names)} values")
+                first = lines.setdefault(row["file"], reader.line_num)
+                if first != reader.line_num:
+                    raise UserError(f"{where}: {row['file']} stands in line {first} already")
+                rows.append((reader.line_num, row))
+        except csv.Error as error:
+            raise UserError(f"{table}, after line {reader.line_num}: {error}") from error
     if not rows:
         raise UserError(f"{table} names no pictures")
     return rows
@@ -153,11 +181,11 @@ def _number(row: dict[str, str], name: str) -> float:
     return value
 
 
-def _write_camera(folder: Path, camera: CameraParameters, taken: set[str]) -> str:
-    """Write the file of a camera; returns its name within `folder`."""
+def _write_camera(folder: Path, camera: CameraParameters) -> str:
+    """Write the file of a camera; returns its name within `folder`, which no other file has."""
     base = f"{CAMERAS}/{camera.width}x{camera.height}-{camera.fov_y_deg:g}deg"
     name, number = f"{base}.yaml", 2
-    while name in taken:  # by a camera that differs only in its height
+    while (folder / name).exists():  # for example of a camera that differs only in its height
         name, number = f"{base}-{number}.yaml", number + 1
     (folder / CAMERAS).mkdir(exist_ok=True)
     write_camera(folder / name, camera, "The pitch of each picture is in labels.csv.")

@@ -1,5 +1,6 @@
 """Tables of other terms become a folder that `evaluate` reads; faulty ones are one clear line."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 HEAD = "file,x_left_m,x_right_m,heading_rad,fov_y_deg,camera_height_m"
+ROW = "a.png,1.7,-1.9,0,40,1.22"
 MORE = ",light,drive,curvature_1pm,focal_px,horizon_y_px,quality"
 
 
@@ -62,13 +64,53 @@ def test_a_table_becomes_labels_and_cameras(tmp_path: Path) -> None:
         ("a.png,1.7,-7,0,40,1.22", "line 2: mr is 7 m; it must be from 0.5 to 5.5"),
         ("a.png,1.7,-1.9,2,40,1.22", "line 2: angle is 2; it must be within 0.5 rad"),
         ("a.png,1.7,-1.9,0,400,1.22", r"line 2: vertical field of view 400\.0 deg"),
+        ("a.png,1.7,-1.9,0,40", "line 2: it has not 6 values"),
+        ("a.png,1.7,-1.9,0,40,1.22,9", "line 2: it has not 6 values"),
+        ('a.png,"1.7"x,-1.9,0,40,1.22', "after line 1: ',' expected after"),
+        (f"{ROW}\nb.png,1.7,-1.9,0,40,1.22\n{ROW}", r"line 4: a\.png stands in line 2 already"),
+        ("b.png,1.7,-1.9,0,40,1.22\n../x.png,1.7,-1.9,0,40,1.22", "line 3: the file"),
     ],
 )
 def test_a_faulty_row_is_refused(tmp_path: Path, row: str, seen: str) -> None:
     path = table(tmp_path / "theirs", row, head=HEAD)
     with pytest.raises(UserError, match=seen):
         import_labels(path, tmp_path / "mine")
-    assert not (tmp_path / "mine" / "labels.csv").exists()
+    assert not (tmp_path / "mine").exists()
+
+
+def test_a_table_in_latin_1_names_files_by_their_bytes(tmp_path: Path) -> None:
+    path = table(tmp_path / "theirs", f"{ROW},caf\xe9", head=f"{HEAD},drive")
+    name = os.fsdecode(b"caf\xe9.png")
+    (path.parent / "a.png").rename(path.parent / name)
+    path.write_bytes(path.read_text().replace("a.png", "caf\xe9.png").encode("latin-1"))
+    import_labels(path, tmp_path / "mine")
+    ((picture,), _) = read_labels(tmp_path / "mine" / "labels.csv")
+    assert (picture.file, picture.drive) == (name, "caf\udce9")
+    assert (tmp_path / "mine" / name).is_file()
+
+
+def test_no_file_of_the_folder_is_replaced(tmp_path: Path) -> None:
+    path = table(tmp_path / "theirs", ROW, head=HEAD)
+    mine = tmp_path / "mine"
+    (mine / "cameras").mkdir(parents=True)
+    (mine / "a.png").write_bytes(b"mine")
+    with pytest.raises(UserError, match=r"line 2: .*mine/a\.png exists and is another file; give"):
+        import_labels(path, mine)
+    assert (mine / "a.png").read_bytes() == b"mine"
+    (mine / "a.png").write_bytes((path.parent / "a.png").read_bytes())  # an equal file
+    (mine / "cameras" / "640x360-40deg.yaml").write_text("mine")
+    import_labels(path, mine)
+    assert (mine / "cameras" / "640x360-40deg.yaml").read_text() == "mine"
+    ((picture,), _) = read_labels(mine / "labels.csv")
+    assert picture.camera == "cameras/640x360-40deg-2.yaml"
+
+
+def test_the_folder_can_be_the_tables_own(tmp_path: Path) -> None:
+    path = table(tmp_path / "theirs", ROW, head=HEAD)
+    before = (path.parent / "a.png").read_bytes()
+    assert import_labels(path, path.parent)["pictures"] == 1
+    assert (path.parent / "a.png").read_bytes() == before
+    assert len(open_custom_images(path.parent, CameraParameters())) == 1
 
 
 def test_faulty_tables_and_options_are_refused(tmp_path: Path) -> None:
