@@ -128,12 +128,13 @@ def ship_command(
     With --evaluation: write only the file README.md for the model in --out. It shows the results
     of evaluations.
     """
-    from mtlnet.export.ship import ship_model, write_page
+    from mtlnet.export.ship import check_page_options, ship_model, write_page
     from mtlnet.inference.model_card import resolve_run
 
+    check_page_options(model, data, evaluation, notes, picture)
     if evaluation:
-        text = "" if notes is None else notes.read_text(encoding="utf-8")
-        typer.echo(write_page(out, evaluation, text, picture))
+        page = str(write_page(out, evaluation, notes, picture))
+        command.print_result({"page": page}, as_json, page)
         return
     result = ship_model(resolve_run(model), out, data)
     if as_json:
@@ -290,6 +291,8 @@ def label_command(
     from runtime.access import check_exposure, read_token
 
     if table is not None:
+        if camera is not None:
+            raise UserError("--import takes the cameras from its table; leave --camera out")
         found = import_labels(table, folder, parse_label_std(label_std or ()))
         told = f"{found['pictures']} pictures of {found['cameras']} cameras in {folder}"
         command.print_result(found, as_json, f"{told}; `mtlnet evaluate --data {folder}`")

@@ -159,7 +159,7 @@ Split = Annotated[
     str,
     typer.Option(
         help="Rounds of the dataset to evaluate on: train, test, unseen (tracks that are kept for "
-        "tests) or all."
+        "tests) or all. Not for a folder with labels.csv, whose images are all evaluated."
     ),
 ]
 Protocol = Annotated[
@@ -259,7 +259,7 @@ LabelCamera = Annotated[
     Path | None,
     typer.Option(
         "--camera",
-        help="Camera file of the pictures. It is copied to FOLDER/camera.yaml.",
+        help="Camera file of the pictures. It is copied to FOLDER/camera.yaml. Not with --import.",
         show_default="FOLDER/camera.yaml",
     ),
 ]

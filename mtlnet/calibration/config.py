@@ -26,7 +26,7 @@ class CalibrateConfig:
             help="Board in the pictures: the numbers of inner corners of a chessboard, for "
             "example 9x6; or for a ChArUco board charuco:5x7:4X4_50:0.75 (numbers of "
             "squares, ArUco dictionary, side of a marker divided by the side of a "
-            "square).",
+            "square). Only for pictures of a board.",
             show_default="the chessboard that most pictures show",
         ),
     ] = ""

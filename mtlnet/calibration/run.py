@@ -13,7 +13,7 @@ from mtlnet.calibration.lens import KnownLens, find_lens
 from mtlnet.sources.find import find_sources
 from mtlnet.sources.kinds import SourceKind, kind_of
 from runtime.camera_file import read_camera, write_camera
-from runtime.files import check_folder
+from runtime.files import check_folder, require_other_file
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -31,10 +31,39 @@ def calibrate(
         check_folder(config.page)
     check_lane_width(config.lane_width_m)
     paths = _files(config.inputs)
+    _require_kept(config, paths)
     films = [path for path in paths if kind_of(path) is SourceKind.FILM]
+    _require_options(config, drive=bool(films or config.drive))
     if films or config.drive:
         return _calibrate_drive(config, paths, films, report)
     return _calibrate_board(config, paths)
+
+
+def _require_kept(config: CalibrateConfig, paths: Sequence[Path]) -> None:
+    """Raise UserError if an output is a file to read. Only --out can be the file of --camera, whose
+    lens it then keeps."""
+    read = [*paths, *([config.photo] if config.photo is not None else [])]
+    require_other_file(config.out, read)
+    if config.page is not None:
+        read += [config.camera] if config.camera is not None else []
+        require_other_file(config.page, read, "--report")
+        if config.page.resolve() == config.out.resolve():
+            raise UserError(f"--out and --report are the same file, {config.out}; give another one")
+
+
+def _require_options(config: CalibrateConfig, *, drive: bool) -> None:
+    """Raise UserError for options that the other kind of calibration has."""
+    if drive and (config.board or config.fisheye):
+        raise UserError(
+            "--board and --fisheye are for pictures of a board; for a drive leave them out, and "
+            "give the lens with --camera"
+        )
+    of_drive = (config.camera, config.fov_y_deg, config.photo, config.lane_width_m)
+    if not drive and any(value is not None for value in of_drive):
+        raise UserError(
+            "--camera, --fov-y-deg, --photo and --lane-width are for a drive; for pictures of a "
+            "drive give --drive, for pictures of a board leave these options out"
+        )
 
 
 def _files(inputs: Sequence[str]) -> list[Path]:

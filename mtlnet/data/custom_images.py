@@ -113,6 +113,14 @@ def has_labels_file(folder: Path) -> bool:
     return (folder / LABELS).is_file()
 
 
+def files_to_read(folder: Path) -> list[Path]:
+    """Return the files of a folder of labelled pictures: `labels.csv`, the pictures and the camera
+    files. Raises UserError for a faulty `labels.csv`."""
+    pictures, _ = read_labels(folder / LABELS)
+    names = [LABELS, *_camera_files(folder, pictures), *(picture.file for picture in pictures)]
+    return [folder / name for name in dict.fromkeys(names)]
+
+
 def open_custom_images(
     folder: Path,
     camera: CameraParameters,

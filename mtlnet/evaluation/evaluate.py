@@ -1,7 +1,7 @@
 """Evaluates a model on rounds of a dataset, or on a user's own labelled pictures: `mtlnet evaluate
 --model RUN --data DIR --json`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.recording import Dataset, Frames, UndecodableImage
-from mtlnet.data.custom_images import has_labels_file, open_custom_images
+from datagen.recording.manifest import MANIFEST
+from datagen.recording.splits import split_path
+from mtlnet.data.custom_images import files_to_read, has_labels_file, open_custom_images
 from mtlnet.data.labels_file import LABELS
 from mtlnet.data.loader import Images
 from mtlnet.data.model_labels import car_outputs
@@ -24,7 +26,7 @@ from mtlnet.evaluation.pictures import judge, picture_report
 from mtlnet.inference.engine import Engine, ViewAverage
 from mtlnet.inference.model_card import ModelCard, ModelError
 from mtlnet.inference.trained_rounds import Seeds
-from runtime.files import check_folder
+from runtime.files import check_folder, require_other_file
 from trackfeatures.errors import UserError
 
 CHUNK = 32  # frames per task of a thread
@@ -52,22 +54,17 @@ def evaluate(
     """
     if every < 1:
         raise UserError(f"--every is {every}; give 1 for all frames, 5 for every fifth")
-    # Before the long computation: check that the files can be written.
     if page is not None:
         page = page_file(page)
-    if worst is not None:
-        check_folder(worst)
     engine = engines[0]
     if has_labels_file(data):
-        if worst is not None:
-            raise UserError(
-                "--worst shows recorded rounds; --report shows all pictures of your own, failures "
-                "first"
-            )
+        _require_options_of_pictures(split, worst)
         return evaluate_custom_images(engines, data, report, every, parse_copies(copies), page)
     if copies:
         raise UserError(f"--copies is for pictures with a {LABELS}; {data} holds recorded rounds")
     dataset = Dataset.open(data)
+    read = [data / MANIFEST, split_path(data), *(info.path for info in dataset.rounds)]
+    _require_writable(page, worst, read)
     frames = dataset.select(split).every(every)
     require_fit(engine.card, frames, split)
     outputs = predict_rounds(engines, frames, data, report)
@@ -87,6 +84,29 @@ def evaluate(
     return found
 
 
+def _require_options_of_pictures(split: str, worst: Path | None) -> None:
+    """Raise UserError for options that are only for recorded rounds."""
+    if worst is not None:
+        raise UserError(
+            "--worst shows recorded rounds; --report shows all pictures of your own, failures first"
+        )
+    if split not in ("test", "all"):  # "test" is the default
+        raise UserError(
+            f"--split {split} is for recorded rounds; all pictures of your own are evaluated"
+        )
+
+
+def _require_writable(page: Path | None, worst: Path | None, inputs: Iterable[Path]) -> None:
+    """Raise UserError, before the long computation, if an output cannot be written, is one of the
+    `inputs`, or is the other output."""
+    for option, path in (("--report", page), ("--worst", worst)):
+        if path is not None:
+            check_folder(path)
+            require_other_file(path, inputs, option)
+    if page is not None and worst is not None and page.resolve() == worst.resolve():
+        raise UserError(f"--report and --worst are the same file, {page}; give another one")
+
+
 def evaluate_custom_images(
     engines: Sequence[Engine],
     folder: Path,
@@ -104,10 +124,10 @@ def evaluate_custom_images(
     little of the model's view, the report has the number but no errors. Raises UserError for faulty
     files.
     """
+    if page is not None:
+        _require_writable(page, None, files_to_read(folder))
     engine = engines[0]
-    images = open_custom_images(
-        folder, engine.card.camera, copies, every=every, skip_refused=True
-    )
+    images = open_custom_images(folder, engine.card.camera, copies, every=every, skip_refused=True)
     trained = engine.card.data.get("pictures", ())
     answers = judge(images, predict_frames(engines, images, report), trained)
     found = {

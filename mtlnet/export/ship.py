@@ -35,10 +35,11 @@ from mtlnet.inference.trained_rounds import Seeds
 from mtlnet.model.network import load_network
 from mtlnet.model.openvino_graph import TOLERANCE
 from mtlnet.uncertainty_fit.head import refit_uncertainty_head
-from runtime.files import atomic_write
+from runtime.files import atomic_write, require_other_file
 from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
 
+PAGE = "README.md"
 PICTURE = "worst.jpg"
 CHECK_IMAGES = 4
 SHOWN = {"split", "frames", "rounds", "engine", "precision", "errors", "presence", *GROUPS}
@@ -132,15 +133,21 @@ def _answers(engine: Engine, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.
 
 
 def write_page(
-    model: Path, evaluations: Sequence[Path], notes: str = "", picture: Path | None = None
+    model: Path,
+    evaluations: Sequence[Path],
+    notes: Path | None = None,
+    picture: Path | None = None,
 ) -> Path:
-    """Write `README.md` to the model's folder: its card, `notes`, the result of its int8 graph's
-    accuracy gate, if it has one, and the tables of evaluations; returns the file.
+    """Write `README.md` to the model's folder: its card, the text of `notes`, the result of its
+    int8 graph's accuracy gate, if it has one, and the tables of evaluations; returns the file.
 
-    `evaluations`: files with the output of `mtlnet evaluate --json`; `picture`: a JPEG of the worst
-    frames, which is copied to the folder. Raises UserError for an evaluation that is unreadable or
-    of another model.
+    `evaluations`: files with the output of `mtlnet evaluate --json`; `notes`: a Markdown file;
+    `picture`: a JPEG of the worst frames, which is copied to the folder. Raises UserError for an
+    evaluation that is unreadable or of another model, for notes that are not UTF-8, and if one of
+    these files would be replaced.
     """
+    out = model / PAGE
+    require_other_file(out, [*evaluations, *(path for path in (notes, picture) if path)])
     card, int8 = read_card(model), read_export(model / INT8) or {}
     found = [_read_evaluation(path, card) for path in evaluations]
     tracks = [name for name in card.data["tracks"] if not name.startswith("random:")]
@@ -151,7 +158,7 @@ def write_page(
         card=card,
         tracks=tracks,
         random_roads=len(card.data["tracks"]) - len(tracks),
-        notes=notes.strip(),
+        notes="" if notes is None else _read_notes(notes),
         gate=int8.get("gate") if int8.get("model_hash") == card.model_hash else None,
         evaluations=found,
         averaged=any(one.get("views", 1) > 1 for one in found),
@@ -162,8 +169,31 @@ def write_page(
     )
     if picture is not None:
         atomic_write(model / PICTURE, picture.read_bytes())
-    atomic_write(model / "README.md", page)
-    return model / "README.md"
+    atomic_write(out, page)
+    return out
+
+
+def check_page_options(
+    model: str,
+    data: Path | None,
+    evaluations: Sequence[Path] | None,
+    notes: Path | None,
+    picture: Path | None,
+) -> None:
+    """Raise UserError for options of `mtlnet ship` that would have no effect."""
+    if not evaluations and (notes is not None or picture is not None):
+        raise UserError("--notes and --picture belong to --evaluation; give it too, or leave both")
+    if evaluations and (model != "default" or data is not None):
+        raise UserError(
+            "--evaluation writes README.md for the model in --out; leave --model and --data out"
+        )
+
+
+def _read_notes(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except UnicodeDecodeError as error:
+        raise UserError(f"--notes {path} is not UTF-8 ({error}); save it as UTF-8") from error
 
 
 def _read_evaluation(path: Path, card: ModelCard) -> dict[str, Any]:

@@ -15,13 +15,14 @@ from typing import Any, Self
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from mtlnet.predict.lenses import with_lens
-from mtlnet.predict.writers import Writer, open_writer, require_other_file
+from mtlnet.predict.writers import Writer, open_writer
 from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
 from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
 from mtlnet.sources.read import READ_AHEAD, SourceImage, read_sources
 from mtlnet.sources.streams import Stream
 from runtime.cli import counted
+from runtime.files import require_other_file
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000

@@ -68,12 +68,6 @@ def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
     return FilmWriter(path, camera, fps) if kind == FILM_SUFFIX else PictureWriter(path, camera)
 
 
-def require_other_file(path: Path, inputs: list[Path]) -> None:
-    """Raise UserError if the output `path` is one of the files to read."""
-    if path.is_file() and any(path.samefile(source) for source in inputs):
-        raise UserError(f"--out {path} is a file to read; give another one")
-
-
 def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:
     """Return the features of one image as a flat dict from column to value, in m and rad; a value
     that is absent, unknown or not predicted is None."""

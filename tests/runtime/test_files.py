@@ -16,6 +16,7 @@ from runtime.files import (
     locked_file,
     locked_folder,
     replaced_files,
+    require_other_file,
     try_lock,
 )
 from trackfeatures import UserError
@@ -152,3 +153,14 @@ def test_the_hash_of_a_file_is_sha_256(tmp_path: Path) -> None:
     path = tmp_path / "abc"
     path.write_bytes(b"abc")  # the example of FIPS 180-2, appendix B.1
     assert file_hash(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_an_output_that_is_a_file_to_read_is_refused(tmp_path: Path) -> None:
+    read, link, missing = (tmp_path / name for name in ("read.csv", "link.csv", "missing.csv"))
+    read.touch()
+    link.symlink_to(read)
+    for path in (read, link, tmp_path / "." / "read.csv"):
+        with pytest.raises(UserError, match=r"--report .* is a file to read; give another one"):
+            require_other_file(path, iter([missing, read]), "--report")
+    require_other_file(tmp_path / "new.csv", [missing, read])
+    require_other_file(tmp_path, [tmp_path])  # a folder, into which new files are written

@@ -104,6 +104,10 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
         ([film, "--lane-width", 36], "--lane-width 36 m; give 2 to 6 m"),
         ([film, "--fov", 0], "--fov-y-deg: "),
         ([round_file], "r.mcap is a round; give a film"),
+        ([film, "--board", "9x6"], "--board and --fisheye are for pictures of a board"),
+        ([picture, "--drive", "--fisheye"], "--board and --fisheye are for pictures of a board"),
+        ([picture, "--fov", 60], "--lane-width are for a drive; for pictures of a drive give"),
+        ([picture, "--lane-width", 3], "--lane-width are for a drive; for pictures of a drive"),
     ]
     for given, seen in cases:
         done = typed("mtlnet", "calibrate", *given, "--out", out)
@@ -111,6 +115,27 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
         assert seen in error_line(done)
         assert "Traceback" not in done.stderr
     assert not out.exists()
+
+
+def test_no_file_to_read_is_replaced(tmp_path: Path) -> None:
+    first, second, lens = (tmp_path / name for name in ("1.png", "2.png", "lens.yaml"))
+    for picture in (first, second):
+        cv2.imwrite(str(picture), road_picture(CAMERA, MARKINGS_M))
+    lens.write_text("{width: 480, height: 360, fov_y_deg: 60}\n")
+    before = {path: path.read_bytes() for path in (first, second, lens)}
+    drive = {"inputs": [str(first), str(second)], "drive": True, "camera": lens}
+    cases: list[tuple[dict[str, Path], str]] = [
+        ({"out": second}, r"--out .*2\.png is a file to read; give another one"),
+        ({"page": first}, r"--report .*1\.png is a file to read"),
+        ({"page": lens}, r"--report .*lens\.yaml is a file to read"),
+        ({"photo": first, "out": first}, r"--out .*1\.png is a file to read"),
+        ({"page": tmp_path / "new"}, "--out and --report are the same file"),
+    ]
+    for given, seen in cases:
+        with pytest.raises(UserError, match=seen):
+            calibrate(CalibrateConfig(**{"out": tmp_path / "new", **drive, **given}))
+    assert before == {path: path.read_bytes() for path in before}
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_film_that_breaks_off_is_told_and_used(

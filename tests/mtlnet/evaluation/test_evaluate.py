@@ -52,6 +52,44 @@ def test_every_nth_picture_is_counted_with_all_its_copies(
     engine = load_engine(published, precision="f32")
     found = evaluate([engine], pictures, "test", every=every, copies="mirrored,turned")["pictures"]
     assert (found["files"], found["cases"], found["refused"]) == (files, 4 * files, 4 * refused)
-    assert {name: (part["cases"], part["refused"]) for name, part in found["by_copy"].items()} == {
-        name: (files, refused) for name in COPIES
-    }
+    counts = {name: (part["cases"], part["refused"]) for name, part in found["by_copy"].items()}
+    assert counts == dict.fromkeys(COPIES, (files, refused))
+
+
+def refused(published: Path, data: Path, match: str, split: str = "test", **options: Path) -> None:
+    """Assert that an evaluation is refused before its first frame, and that no file changes."""
+    files = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    with pytest.raises(UserError, match=match):
+        evaluate(
+            [load_engine(published, precision="f32")],
+            data,
+            split,
+            lambda count, frames: pytest.fail("a frame was evaluated"),
+            **options,  # type: ignore[arg-type]
+        )
+    assert files == {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", ["labels.csv", "0.png", "narrow.yaml"])
+def test_a_page_does_not_replace_a_file_of_the_pictures(
+    published: Path, pictures: Path, name: str
+) -> None:
+    refused(published, pictures, f"--report .*{name} is a file to read", page=pictures / name)
+
+
+@pytest.mark.parametrize("name", ["rounds/r000.mcap", "splits/default.json"])
+@pytest.mark.parametrize("option", ["page", "worst"])
+def test_an_output_does_not_replace_a_file_of_the_dataset(
+    published: Path, dataset: Path, name: str, option: str
+) -> None:
+    refused(published, dataset, f"{name} is a file to read", **{option: dataset / name})
+
+
+def test_the_two_outputs_are_two_files(published: Path, dataset: Path, tmp_path: Path) -> None:
+    both = {"page": tmp_path / "x", "worst": tmp_path / "y" / ".." / "x"}
+    (tmp_path / "y").mkdir()
+    refused(published, dataset, "--report and --worst are the same file", **both)
+
+
+def test_pictures_have_no_split(published: Path, pictures: Path) -> None:
+    refused(published, pictures, "--split nonsense is for recorded rounds; all", split="nonsense")

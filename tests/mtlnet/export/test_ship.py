@@ -30,6 +30,7 @@ from mtlnet.inference.model_card import (
 from mtlnet.model.openvino_graph import TOLERANCE
 from serve.scheduling.warmup import warm_up
 from tests.mtlnet.conftest import write_dataset
+from tests.mtlnet.test_cli import mtlnet, refused
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -140,7 +141,9 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
     file.write_text(json.dumps(found))
     picture = tmp_path / "sheet.jpg"
     picture.write_bytes(b"a JPEG")
-    page = write_page(shipped, [file], "Trained by hand.", picture).read_text()
+    notes = tmp_path / "notes.md"
+    notes.write_text("Trained by hand.\n")
+    page = write_page(shipped, [file], notes, picture).read_text()
     assert "![frames with the largest errors](worst.jpg)" in page
     assert (shipped / "worst.jpg").read_bytes() == b"a JPEG"
     for name in ("README.md", "worst.jpg"):
@@ -184,8 +187,36 @@ def test_the_page_of_a_shipped_model_has_the_figures_of_its_evaluations(
         with pytest.raises(UserError, match="no result of"):
             write_page(shipped, [file])
     file.write_text(json.dumps({**found, "pictures": {"cases": 3}}))
-    with pytest.raises(UserError, match=r"test\.json evaluates pictures of your own; the page shows"):
+    with pytest.raises(
+        UserError, match=r"test\.json evaluates pictures of your own; the page shows"
+    ):
         write_page(shipped, [file])
+
+
+def test_files_and_options_that_the_page_cannot_use(
+    shipped: Path, dataset: Path, tmp_path: Path
+) -> None:
+    found = evaluate([load_engine(shipped, "openvino", "f32")], dataset, "test", every=8)
+    file, notes, model = (tmp_path / name for name in ("test.json", "notes.md", "model"))
+    file.write_text(json.dumps(found))
+    shutil.copytree(shipped, model)
+    own = model / "README.md"
+    ship = ("ship", "--out", model)
+    judged = (*ship, "--evaluation", file, "--notes", notes)
+    notes.write_bytes(b"caf\xe9")
+    assert "notes.md is not UTF-8 (" in refused(*judged)
+    notes.write_text("caf\u00e9", encoding="utf-8")
+    belong = "--notes and --picture belong to --evaluation"
+    assert belong in refused(*ship, "--notes", notes)
+    assert belong in refused(*ship, "--picture", notes)
+    assert "leave --model and --data out" in refused(*judged, "--model", "nothing")
+    assert "leave --model and --data out" in refused(*judged, "--data", "nowhere")
+    assert not own.exists()
+    assert json.loads(mtlnet(*judged, "--json").stdout) == {"page": str(own)}
+    before = own.read_bytes()
+    assert "caf\u00e9" in before.decode()
+    assert "README.md is a file to read" in refused(*judged[:-1], own)
+    assert own.read_bytes() == before
 
 
 def test_the_page_states_the_number_of_views(shipped: Path, dataset: Path, tmp_path: Path) -> None:

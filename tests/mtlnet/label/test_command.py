@@ -79,6 +79,8 @@ def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
     seen = refused("label", pictures, "--no-model", "--host", "0.0.0.0")
     assert "--host 0.0.0.0 can be reached from other machines: set a token" in seen
     assert "--label-std belongs to --import" in refused("label", pictures, "--label-std", "1,1")
+    both = refused("label", pictures, "--import", "table.csv", "--camera", "camera.yaml")
+    assert "--import takes the cameras from its table; leave --camera out" in both
     assert "there is no folder" in refused("label", tmp_path / "none", "--no-model")
 
 
