@@ -1,7 +1,7 @@
 """Evaluates a model on rounds of a dataset, or on a user's own labelled pictures: `mtlnet evaluate
 --model RUN --data DIR --json`."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -96,7 +96,7 @@ def _require_options_of_pictures(split: str, worst: Path | None) -> None:
         )
 
 
-def _require_writable(page: Path | None, worst: Path | None, inputs: Iterable[Path]) -> None:
+def _require_writable(page: Path | None, worst: Path | None, inputs: Sequence[Path]) -> None:
     """Raise UserError, before the long computation, if an output cannot be written, is one of the
     `inputs`, or is the other output."""
     for option, path in (("--report", page), ("--worst", worst)):

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -123,19 +124,20 @@ def test_no_file_to_read_is_replaced(tmp_path: Path) -> None:
         cv2.imwrite(str(picture), road_picture(CAMERA, MARKINGS_M))
     lens.write_text("{width: 480, height: 360, fov_y_deg: 60}\n")
     before = {path: path.read_bytes() for path in (first, second, lens)}
-    drive = {"inputs": [str(first), str(second)], "drive": True, "camera": lens}
-    cases: list[tuple[dict[str, Path], str]] = [
+    new, inputs = tmp_path / "new", [str(first), str(second)]
+    drive = CalibrateConfig(inputs, new, drive=True, camera=lens)
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"out": second}, r"--out .*2\.png is a file to read; give another one"),
         ({"page": first}, r"--report .*1\.png is a file to read"),
         ({"page": lens}, r"--report .*lens\.yaml is a file to read"),
         ({"photo": first, "out": first}, r"--out .*1\.png is a file to read"),
-        ({"page": tmp_path / "new"}, "--out and --report are the same file"),
+        ({"page": new}, "--out and --report are the same file"),
     ]
     for given, seen in cases:
         with pytest.raises(UserError, match=seen):
-            calibrate(CalibrateConfig(**{"out": tmp_path / "new", **drive, **given}))
+            calibrate(replace(drive, **given))
     assert before == {path: path.read_bytes() for path in before}
-    assert not (tmp_path / "new").exists()
+    assert not new.exists()
 
 
 def test_a_film_that_breaks_off_is_told_and_used(

@@ -1,6 +1,7 @@
 """Evaluation of a model on a dataset or on pictures: checks before the first frame, counts."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,16 +57,15 @@ def test_every_nth_picture_is_counted_with_all_its_copies(
     assert counts == dict.fromkeys(COPIES, (files, refused))
 
 
-def refused(published: Path, data: Path, match: str, split: str = "test", **options: Path) -> None:
+def refused(published: Path, data: Path, match: str, **options: Any) -> None:
     """Assert that an evaluation is refused before its first frame, and that no file changes."""
     files = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
     with pytest.raises(UserError, match=match):
         evaluate(
             [load_engine(published, precision="f32")],
             data,
-            split,
-            lambda count, frames: pytest.fail("a frame was evaluated"),
-            **options,  # type: ignore[arg-type]
+            report=lambda count, frames: pytest.fail("a frame was evaluated"),
+            **{"split": "test", **options},
         )
     assert files == {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
 
