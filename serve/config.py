@@ -11,6 +11,7 @@ MAX_BODY_BYTES = 4 << 20
 MAX_HEAD_BYTES = 32 << 10
 MAX_NAME = 128  # characters of a frame id, a request id or a stream id
 MAX_DEADLINE_MS = 60_000  # the longest deadline that a client may set
+MAPPED_BITS = 96  # length of ::ffff:, the prefix of IPv4-mapped IPv6 addresses
 
 
 @dataclass(frozen=True)
@@ -61,18 +62,29 @@ class ServiceConfig:
 
 
 def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:
-    """Return the values of `--trusted-proxy`. Raises UserError if one of them is neither an IP
-    address nor a network."""
-    found = tuple(proxies)
-    for proxy in found:
+    """Return the values of `--trusted-proxy`; an IPv4-mapped IPv6 network (::ffff:10.0.0.1) is
+    returned as an IPv4 network. Raises UserError if a value is neither an IP address nor a
+    network."""
+    found = []
+    for proxy in proxies:
         try:
-            ip_network(proxy)
+            network = ip_network(proxy)
+            mapped = getattr(network.network_address, "ipv4_mapped", None)
+            is_ipv4 = mapped is not None and network.prefixlen >= MAPPED_BITS
+            found.append(f"{mapped}/{network.prefixlen - MAPPED_BITS}" if is_ipv4 else proxy)
         except ValueError as error:
             raise UserError(
                 f"--trusted-proxy is {proxy!r} ({error}); give an address or a network, for "
                 "example 10.0.0.7 or 10.0.0.0/8"
             ) from error
-    return found
+    return tuple(found)
+
+
+def ipv4_mapped(proxies: Iterable[str]) -> list[str]:
+    """Return the IPv4-mapped IPv6 network of each IPv4 address or network in `proxies`. A proxy
+    writes this form of an address to X-Forwarded-For if its own socket accepts IPv4 and IPv6."""
+    networks = [found for found in map(ip_network, proxies) if found.version == 4]
+    return [f"::ffff:{n.network_address}/{MAPPED_BITS + n.prefixlen}" for n in networks]
 
 
 @lru_cache(4096)

@@ -132,7 +132,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self.guard.admit(self, self.client[0] if self.client else "")
+        self.client = self.guard.admit(self, self.client)
         self._settle()
         guard, limit = self.guard, self.guard.limits.connections
         count = len(self.connections) - len(guard.closing) + guard.other_connections()

@@ -66,6 +66,7 @@ class Drained(Guarded, Protocol):
 
 
 Group = dict[Guarded, None]
+Address = tuple[str, int]  # IP address and port
 
 
 def _group() -> Group:
@@ -109,11 +110,19 @@ class ConnectionGuard:
     paused: list[HttpToolsProtocol] = field(default_factory=list)
     """Connections that are not read for REFUSAL_PAUSE_S; see `pause_reading`."""
 
-    def admit(self, connection: Guarded, address: str) -> None:
-        """Count a new connection from the client at `address`."""
+    def admit(self, connection: Guarded, client: Address | None) -> Address | None:
+        """Count a new connection from `client`; return the client's address.
+
+        A socket on `::` reports the IPv4 address 10.0.0.1 as ::ffff:10.0.0.1; it is returned as
+        10.0.0.1, the form in which proxies are given.
+        """
+        address, port = client or ("", 0)
+        if "." in address:
+            address = address.removeprefix("::ffff:")
         if not _is_any_of(address, self.limits.trusted_proxies):
             connection.network = network_of(address)
             self.open[connection.network] += 1
+        return client and (address, port)
 
     def place(self, connection: Guarded, group: Group) -> float:
         """Move a connection to the end of a group and restart its waiting time; return the clock's

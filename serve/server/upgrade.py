@@ -61,6 +61,7 @@ def _open_websocket(connection: "GuardedProtocol") -> None:
     )
     websocket.network = connection.network
     websocket.connection_made(connection.transport)
+    websocket.client = connection.client
     connection.transport.set_protocol(websocket)
     websocket.data_received(head)
     connection.parser = None  # type: ignore[assignment]  # breaks a reference cycle

@@ -20,7 +20,7 @@ from typing import Any, cast
 import uvicorn
 
 from serve.app import Service
-from serve.config import MAX_BODY_BYTES, Limits
+from serve.config import MAX_BODY_BYTES, Limits, ipv4_mapped
 from serve.server.fast_path import DirectProtocol
 from serve.server.guard import ConnectionGuard, Drained
 from serve.server.heap import HeapTrimmer
@@ -209,6 +209,7 @@ class WorkerServer(uvicorn.Server):
 
 
 def _uvicorn_config(app: Any) -> uvicorn.Config:
+    proxies = app.limits.trusted_proxies or ("127.0.0.1",)
     return uvicorn.Config(
         app,
         loop="uvloop",
@@ -222,5 +223,5 @@ def _uvicorn_config(app: Any) -> uvicorn.Config:
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         # Never None: with None uvicorn reads an environment variable.
-        forwarded_allow_ips=list(app.limits.trusted_proxies) or ["127.0.0.1"],
+        forwarded_allow_ips=[*proxies, *ipv4_mapped(proxies)],
     )

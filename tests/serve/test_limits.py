@@ -200,7 +200,7 @@ class Connection:
     def __init__(self, guard: ConnectionGuard, address: str) -> None:
         self.since_s, self.network, self.ended = 0.0, "", False
         self.group: Group = {}
-        guard.admit(self, address)
+        guard.admit(self, (address, 50_000))
 
     def give_way(self) -> None:
         self.ended = True

@@ -2,6 +2,7 @@
 
 import socket
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 from typer.testing import CliRunner
@@ -16,7 +17,7 @@ from serve.scheduling.rate_limit import RateLimiter, client_key
 from serve.scheduling.streams import stream_key
 from serve.shared_memory import create_shared_memory
 from serve.workers.worker_process import WorkerTask
-from tests.serve.attacks.conftest import Target, read_rest, status_of
+from tests.serve.attacks.conftest import Target, read_head, read_rest, status_of
 from tests.serve.conftest import JPEG, FakeEngine, Served, assert_problem, serving
 from trackfeatures.errors import UserError
 
@@ -213,16 +214,45 @@ def test_a_proxy_that_is_not_trusted_names_no_client(engine: FakeEngine) -> None
         assert replies == {200}
 
 
+@pytest.mark.parametrize(
+    ("proxies", "forwarded"),
+    [
+        ((), "203.0.113.1"),
+        (("127.0.0.1",), "203.0.113.1"),
+        (("::ffff:127.0.0.1",), "203.0.113.1"),
+        (("127.0.0.0/8",), "203.0.113.1, ::ffff:127.0.0.9"),  # through two proxies
+    ],
+)
+def test_a_socket_for_ipv4_and_ipv6_trusts_a_proxy_on_ipv4(
+    engine: FakeEngine, proxies: tuple[str, ...], forwarded: str
+) -> None:
+    """The socket of `--host ::` reports the address 127.0.0.1 as ::ffff:127.0.0.1."""
+    limits = Limits(token=TOKEN, rate=2.0, trusted_proxies=check_proxies(proxies))
+    with serving(engine, limits=limits, host="::") as service, ExitStack() as stack:
+        target = Target(service.port, TOKEN)
+        statuses = set()
+        for _ in range(6):
+            connection = stack.enter_context(target.dial())
+            connection.sendall(target.handshake(X_Forwarded_For=forwarded))
+            statuses.add(status_of(read_head(connection)))
+        assert statuses == {101, 429}
+        assert service.post(JPEG, X_Forwarded_For=forwarded).status == 429
+        # Connections from a proxy that was given with --trusted-proxy are not counted together.
+        assert set(service.server.guard.open) == (set() if proxies else {"127.0.0.1"})
+
+
 def test_the_environment_makes_no_proxy_trusted(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FORWARDED_ALLOW_IPS", "*")  # uvicorn's variable
     with serving(engine) as service:
-        assert service.server.config.forwarded_allow_ips == ["127.0.0.1"]
+        proxies = service.server.config.forwarded_allow_ips
+        assert proxies == ["127.0.0.1", "::ffff:127.0.0.1/128"]
 
 
 def test_proxies_are_addresses_or_networks() -> None:
     assert check_proxies(["10.0.0.1", "fd00::/8"]) == ("10.0.0.1", "fd00::/8")
+    assert check_proxies(["::ffff:10.0.0.1", "::ffff:a00:0/104"]) == ("10.0.0.1/32", "10.0.0.0/8")
     for wrong in ("proxy.example", "10.0.0.1/8", "*", ""):
         with pytest.raises(UserError, match="--trusted-proxy is"):
             check_proxies([wrong])
