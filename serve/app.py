@@ -24,7 +24,7 @@ from serve.api.features_asgi import FeaturesEndpoint
 from serve.api.problem_handlers import install_problem_handlers
 from serve.api.stream import Stream
 from serve.asgi import App, Receive, Scope, Send, send_reply, without_body
-from serve.cameras import Cameras
+from serve.cameras import NO_CAMERAS, Cameras
 from serve.config import Limits
 from serve.observability.logs import RefusalLog
 from serve.observability.metrics import MEDIA_TYPE, Metrics
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     from serve.observability.tracing import RequestTracer
 
-NO_CAMERAS: Cameras = {}
 DESCRIPTION = "One driver-view image in, track features out. Angles in rad, distances in m."
 
 
@@ -70,7 +69,7 @@ class Service:
         streams = StreamTable(self.shared.streams())
         workers = self.shared.workers
         self.frame_queue = FrameQueue(
-            engine, check, streams, self.limits.queue, single_core=_cores() < 2 * workers
+            engine, check, streams, self.limits.queue, _cores() < 2 * workers, cameras
         )
         self.metrics = Metrics(self.shared, block)
         self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
@@ -80,7 +79,6 @@ class Service:
             self.bodies,
             RefusalLog(workers),
             self.limits.log_answers,
-            cameras,
             None if tracer is None else _request_tracer(tracer),
         )
         self.make_request = partial(FeaturesRequest, self.frames)
@@ -175,7 +173,7 @@ def _add_status(app: FastAPI, frames: FrameHandler) -> None:
     async def model() -> dict[str, Any]:
         loaded = frame_queue.loaded
         card = asdict(loaded.engine.card, dict_factory=stored)
-        known = {name: camera.as_dict() for name, camera in frames.cameras.items()}
+        known = {name: camera.as_dict() for name, camera in loaded.cameras.items()}
         return {**loaded.provenance, **card, "cameras": known}
 
 

@@ -14,6 +14,7 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 Cameras = Mapping[str, CameraParameters]
+NO_CAMERAS: Cameras = {}
 MAX_CAMERAS = 64
 
 

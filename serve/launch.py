@@ -7,6 +7,7 @@ other down. All workers share the listening sockets; `serve.workers.supervisor` 
 import asyncio
 import socket
 import sys
+from functools import partial
 from pathlib import Path
 
 from mtlnet.inference.model_card import read_card, resolve_run
@@ -25,14 +26,13 @@ def run(config: ServiceConfig) -> None:
     check_exposure(config.host, config.limits.token, config.insecure)
     # A missing exporter or model is reported here, before any process is started.
     telemetry.exporter_name()
-    cameras = _cameras(config.cameras, resolve_run(config.model))
+    resolve_run(config.model)
     listeners = bind_all(config.host, config.port)
-    asyncio.run(_serve(config, listeners, cameras))
+    asyncio.run(_serve(config, listeners))
 
 
-async def _serve(
-    config: ServiceConfig, listeners: list[socket.socket], cameras: dict[str, CameraParameters]
-) -> None:
+async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
+    cameras = partial(_cameras, config.cameras)
     plan = ServicePlan(
         config.model, resolve_run, config.workers, config.limits, cameras, config.views
     )
@@ -66,7 +66,8 @@ async def _serve(
 
 
 def _cameras(options: tuple[str, ...], run: Path) -> dict[str, CameraParameters]:
-    """Read the cameras of `--camera`, and check them against the model in the folder `run`."""
+    """Read the cameras of `--camera` for the model in the folder `run`. Raises UserError, also for a
+    camera that does not show enough of the model's view."""
     if not options:
         return {}
     from serve.cameras import read_cameras  # imported late: loading OpenCV delays the workers

@@ -1,9 +1,9 @@
 """One worker process: one engine, one event loop. `serve.workers.supervisor` starts it as
 `python -m serve.worker FD`; supervisor and worker exchange lines of JSON over the socket FD.
 
-The supervisor sends the WorkerTask first. For a reload it sends {"load": folder, "generation": n};
-if the reload fails in any worker, it sends {"drop": n}, and the new weights are discarded. The
-worker sends {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
+The supervisor sends the WorkerTask first. For a reload it sends {"load": folder, "generation": n,
+"cameras": {name: camera}}; the cameras replace the old ones together with the weights. If the
+reload fails in any worker, it sends {"drop": n}, and both are discarded. The worker sends {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
 ...} for each generation n of weights, and {"ready": true} once it can answer images. When the
 supervisor closes the socket, the worker stops.
 """
@@ -20,11 +20,12 @@ from typing import Any
 
 from mtlnet.inference.engine import Engine, load_engine
 from serve.app import Service
+from serve.cameras import Cameras
 from serve.observability import logs, telemetry
 from serve.scheduling.warmup import warm_up
 from serve.server.worker_server import WorkerServer
 from serve.shared_memory import COMMITTED_GENERATION, WorkerPeers, attach_shared_memory
-from serve.workers.worker_process import WorkerTask
+from serve.workers.worker_process import WorkerTask, read_cameras
 from trackfeatures.errors import UserError
 
 logger = logging.getLogger(__name__)
@@ -126,8 +127,8 @@ def handle_commands(
     for line in lines:
         message = json.loads(line)
         if "load" in message:
-            folder, generation = message["load"], message["generation"]
-            reload(supervisor, app, folder, generation, views=views)
+            cameras = read_cameras(message["cameras"])
+            reload(supervisor, app, message["load"], message["generation"], cameras, views=views)
         elif "drop" in message:
             app.frame_queue.drop_staged_model()
     server.should_exit = True
@@ -138,11 +139,13 @@ def reload(
     app: Service,
     folder: str,
     generation: int,
+    cameras: Cameras,
     *,
     views: int,
 ) -> None:
-    """Load and check new weights while the old weights are in use. The new weights replace the old
-    ones once the supervisor commits `generation`."""
+    """Load and check new weights while the old weights are in use. The new weights and `cameras`,
+    the cameras that clients can name, replace the old ones once the supervisor commits
+    `generation`."""
     head = app.shared.head()
     try:
         engine = load(Path(folder), None, views=views)
@@ -154,7 +157,7 @@ def reload(
         logger.exception("new weights failed")
         supervisor.send(failed=generation, why=repr(error))
         return
-    app.frame_queue.stage_model(engine, lambda: head[COMMITTED_GENERATION] >= generation)
+    app.frame_queue.stage_model(engine, cameras, lambda: head[COMMITTED_GENERATION] >= generation)
     supervisor.send_loaded(generation, engine)
 
 

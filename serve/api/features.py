@@ -23,7 +23,6 @@ from mtlnet.inference.image_decoding.decode import (
     read_header,
 )
 from mtlnet.inference.image_decoding.errors import ImageError
-from mtlnet.inference.rectification import Rectification
 from serve.api.request_options import (
     CAMERA,
     FIELD_OF_VIEW,
@@ -33,7 +32,6 @@ from serve.api.request_options import (
     parse_options,
     request_id_of,
 )
-from serve.cameras import Cameras
 from serve.observability.logs import RefusalLog, log_answer
 from serve.observability.metrics import Metrics
 from serve.problems import INVALID_REQUEST, Problem, as_problem, forget_frames, internal_error
@@ -41,8 +39,8 @@ from serve.replies import Reply, problem_reply
 from serve.scheduling.body_budget import BodyBudget, BodyShare
 from serve.scheduling.frame import Frame, FrameResult, PixelReader, ResultCallback
 from serve.scheduling.frame_queue import FrameQueue
+from serve.scheduling.loaded_engine import LoadedEngine
 from serve.scheduling.streams import stream_key
-from trackfeatures.camera import CameraParameters
 
 if TYPE_CHECKING:
     from opentelemetry.trace import Span
@@ -58,30 +56,30 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ImageCamera:
-    """The camera of an image: `camera` if it is given, otherwise the model's camera. In the second
-    case `fov_y_deg`, if it is given, replaces the vertical field of view."""
+    """The camera of an image: the camera named `name` if it is given, otherwise the model's camera.
+    In the second case `fov_y_deg`, if it is given, replaces the vertical field of view."""
 
     fov_y_deg: float | None = None
-    camera: CameraParameters | None = None
+    name: str | None = None
 
-    def crop_px(self, width: int, height: int, view: CameraParameters) -> list[int] | None:
+    def crop_px(self, width: int, height: int, loaded: LoadedEngine) -> list[int] | None:
         """Return [left, top, width, height] in px of the part of an image that the model's camera
-        `view` shows; None if the part is the whole image, or if the image is warped.
+        shows; None if the part is the whole image, or if the image is warped.
 
-        Raises ImageError if an image of this size does not cover what `view` shows.
+        Raises ImageError if an image of this size does not cover what the model's camera shows.
         """
-        if self.camera is not None:
-            Rectification(self.camera, view).check(width, height)
+        if self.name is not None:
+            loaded.rectification(self.name).check(width, height)
             return None
-        box = crop_box(width, height, view, self.fov_y_deg)
+        box = crop_box(width, height, loaded.view, self.fov_y_deg)
         return None if box is None else [box.left, box.top, box.width, box.height]
 
-    def to_model_view(self, image: NDArray[np.uint8], view: CameraParameters) -> NDArray[np.uint8]:
+    def to_model_view(self, image: NDArray[np.uint8], loaded: LoadedEngine) -> NDArray[np.uint8]:
         """Convert `image` (H, W, 3) of this camera to the view of the model's camera: uint8 RGB
         (view.height, view.width, 3). Raises ImageError."""
-        if self.camera is None:
-            return crop_and_resize(image, view, self.fov_y_deg)
-        return Rectification(self.camera, view).image(image)
+        if self.name is None:
+            return crop_and_resize(image, loaded.view, self.fov_y_deg)
+        return loaded.rectification(self.name).image(image)
 
 
 class FrameHandler:
@@ -94,11 +92,9 @@ class FrameHandler:
         bodies: BodyBudget,
         refusals: RefusalLog,
         log_answers: bool,
-        cameras: Cameras,
         tracer: "RequestTracer | None" = None,
     ) -> None:
         self.queue = queue
-        self.cameras = cameras
         self.tracer = tracer
         self._bodies = bodies
         self._metrics = metrics
@@ -118,14 +114,13 @@ class FrameHandler:
         `ImageCamera.crop_px`). Raises Problem, ImageError.
         """
         self.queue.check_ready()
-        camera, source = self.queue.loaded.engine.card.camera, self.image_camera(options)
-        header = read_header(body)
-        crop = source.crop_px(header.width, header.height, camera)
+        source, header = self.image_camera(options), read_header(body)
+        crop = source.crop_px(header.width, header.height, self.queue.loaded)
         small = header.width * header.height <= SMALL_PIXELS and header.decode_ms <= SMALL_MS
         small = small and (len(body) <= SMALL_BYTES or header.png_header is not None)
 
-        def read(view: CameraParameters) -> NDArray[np.uint8]:
-            return source.to_model_view(decode_whole(body, header), view)
+        def read(loaded: LoadedEngine) -> NDArray[np.uint8]:
+            return source.to_model_view(decode_whole(body, header), loaded)
 
         frame = _frame(options, client, read, header.decode_ms, small, source)
         self.queue.submit(frame, on_result)
@@ -139,10 +134,11 @@ class FrameHandler:
         if options.fov_y_deg is not None:
             seen = f"{CAMERA} and {FIELD_OF_VIEW} are both given"
             raise Problem(INVALID_REQUEST, f"{seen}; the camera has a field of view, so send one")
-        if name not in self.cameras:
-            known = ", ".join(self.cameras) or "none (serve --camera NAME=FILE gives it one)"
+        cameras = self.queue.loaded.cameras
+        if name not in cameras:
+            known = ", ".join(cameras) or "none (serve --camera NAME=FILE gives it one)"
             raise Problem(INVALID_REQUEST, f"{CAMERA} is {name[:80]!r}; the service knows {known}")
-        return ImageCamera(None, self.cameras[name])
+        return ImageCamera(None, name)
 
     async def predict_file(
         self, options: RequestOptions, body: bytes, client: str
@@ -328,7 +324,7 @@ def _frame(
 ) -> Frame:
     stream = stream_key(client, options.stream) if options.stream else 0
     return Frame(
-        read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms, source.camera
+        read, options.stamp_ns, stream, options.deadline_ns, small, client, read_ms, source.name
     )
 
 

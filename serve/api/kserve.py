@@ -222,16 +222,15 @@ async def _pixel_reader(
     unknown = next((o.name for o in request.outputs if o.name not in OUTPUTS), None)
     if unknown is not None:
         raise invalid_request(f"unknown output {unknown[:80]!r}; known are {', '.join(OUTPUTS)}")
-    camera = frames.queue.loaded.engine.card.camera
     if tensor.name == "image":
         body = await read_image_bytes(tensor, binary)
         header = read_header(body)
-        source.crop_px(header.width, header.height, camera)
-        return lambda view: source.to_model_view(decode_whole(body, header), view), header.decode_ms
+        source.crop_px(header.width, header.height, frames.queue.loaded)
+        return lambda to: source.to_model_view(decode_whole(body, header), to), header.decode_ms
     pixels = find_pixels(tensor, binary)
     check_size(pixels.width, pixels.height)
-    source.crop_px(pixels.width, pixels.height, camera)
-    return lambda view: source.to_model_view(pixels.read(), view), pixels.read_ms
+    source.crop_px(pixels.width, pixels.height, frames.queue.loaded)
+    return lambda to: source.to_model_view(pixels.read(), to), pixels.read_ms
 
 
 def _tensors(prediction: Prediction) -> dict[str, NDArray[np.float32]]:

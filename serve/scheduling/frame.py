@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtlnet.inference.prediction import Prediction
-from trackfeatures.camera import CameraParameters
+from serve.scheduling.loaded_engine import LoadedEngine
 
-PixelReader = Callable[[CameraParameters], NDArray[np.uint8]]
-"""Called with the model's camera; returns the image's pixels (height, width, 3), uint8 RGB, in the
-view of that camera."""
+PixelReader = Callable[[LoadedEngine], NDArray[np.uint8]]
+"""Called with the engine that will process the pixels; returns the image's pixels (height, width,
+3), uint8 RGB, in the view of the model's camera."""
 ResultCallback = Callable[["FrameResult | Exception"], None]
 """Called once with the result of a frame, or with the error that ended it."""
 
@@ -37,8 +37,8 @@ class Frame:
     `stamp_ns`: time at which the request began; `deadline_ns`: time until which the processing must
     begin; both in ns of the monotonic clock. `stream`: key of the stream, 0 for a frame without a
     stream. `client`: address of the client. `cost_ms`: estimated decoding time in ms; for a `small`
-    image it is shorter than the forward pass of the network. `source`: the image's camera if `read`
-    warps the pixels into the view of the model's camera, else None.
+    image it is shorter than the forward pass of the network. `camera`: the name of the image's
+    camera if `read` warps the pixels into the view of the model's camera, else None.
     """
 
     read: PixelReader
@@ -48,4 +48,4 @@ class Frame:
     small: bool = False
     client: str = ""
     cost_ms: float = 0.0
-    source: CameraParameters | None = None
+    camera: str | None = None

@@ -25,7 +25,7 @@ from queue import SimpleQueue
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import decode_outputs
-from mtlnet.inference.rectification import Rectification
+from serve.cameras import NO_CAMERAS, Cameras
 from serve.problems import DEADLINE_PASSED, NOT_READY, SUPERSEDED, Problem
 from serve.scheduling.fair_queue import FairQueue, Slot
 from serve.scheduling.frame import Frame, FrameResult, ResultCallback
@@ -56,13 +56,14 @@ class FrameQueue:
         streams: StreamTable,
         capacity: int,
         single_core: bool = False,
+        cameras: Cameras = NO_CAMERAS,
     ) -> None:
         """At most `capacity` frames wait while a frame is processed. `warm_up` runs and checks the
         engine before the first frame. `streams` records the newest frame of each stream. With
         `single_core` (the worker has no second core) the event loop itself processes small frames
-        even if several wait.
+        even if several wait. `cameras` are the cameras that frames can name.
         """
-        self._current = LoadedEngine.of(engine)
+        self._current = LoadedEngine.of(engine, cameras)
         self._staged: StagedEngine | None = None
         self._model_lock = threading.Lock()  # for _current and _staged; held briefly
         self._warm_up = warm_up
@@ -114,14 +115,17 @@ class FrameQueue:
         if error is not None:
             raise Problem(NOT_READY, f"the model failed its check; no image is answered: {error}")
 
-    def stage_model(self, engine: Engine, is_committed: Callable[[], bool]) -> None:
-        """Switch to `engine`, already warm and checked, once `is_committed()` returns True.
+    def stage_model(
+        self, engine: Engine, cameras: Cameras, is_committed: Callable[[], bool]
+    ) -> None:
+        """Switch to `engine`, already warm and checked, and to `cameras`, the cameras that frames
+        can name, once `is_committed()` returns True.
 
         `is_committed` is called at each frame.
         """
         with self._model_lock:
             self._promote_staged()
-            self._staged = StagedEngine(LoadedEngine.of(engine), is_committed)
+            self._staged = StagedEngine(LoadedEngine.of(engine, cameras), is_committed)
 
     def drop_staged_model(self) -> None:
         """Discard the staged engine, unless its `is_committed()` already returns True."""
@@ -296,12 +300,11 @@ class FrameQueue:
             loaded = self._current
         if loaded is not self._fast_engine:
             self._fast_engine, self._fast_frames = loaded, 0
-        camera = loaded.engine.card.camera
-        image = frame.read(camera)
+        image = frame.read(loaded)
         decoded = time.monotonic_ns()
         outputs = loaded.engine(image)
-        if frame.source is not None:
-            outputs = Rectification(frame.source, camera).outputs(outputs[None])[0]
+        if frame.camera is not None:
+            outputs = loaded.rectification(frame.camera).outputs(outputs[None])[0]
         prediction = decode_outputs(outputs)
         end = time.monotonic_ns()
         frame_ms = (end - start) / 1e6

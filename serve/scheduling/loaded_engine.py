@@ -1,29 +1,44 @@
-"""Dataclasses of the frame queue's engines: the engine in use, and one that is to replace it."""
+"""Dataclasses of the frame queue's engines: the engine in use, and one that is to replace it, each
+with the cameras that clients can name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
+from mtlnet.inference.rectification import Rectification
+from serve.cameras import Cameras
+from trackfeatures.camera import CameraParameters
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedEngine:
-    """An engine, and the members that identify it and its model in every answer."""
+    """An engine, the members that identify it and its model in every answer, and the cameras that
+    clients can name. Values that a camera's file omits come from this model's camera."""
 
     engine: Engine
     provenance: dict[str, str]
+    cameras: Cameras
+
+    @property
+    def view(self) -> CameraParameters:
+        """The model's camera."""
+        return self.engine.card.camera
+
+    def rectification(self, camera: str) -> Rectification:
+        """Return the conversion from the camera of this name to the model's camera."""
+        return Rectification(self.cameras[camera], self.view)
 
     @classmethod
-    def of(cls, engine: Engine) -> "LoadedEngine":
-        """Combine `engine` with the members that identify it."""
+    def of(cls, engine: Engine, cameras: Cameras) -> "LoadedEngine":
+        """Combine `engine` with the members that identify it, and with `cameras`."""
         provenance = {
             "model": engine.card.model_hash,
             "definitions_version": tf.VERSION,
             "engine": engine.kind,
             "precision": engine.precision,
         }
-        return cls(engine, provenance)
+        return cls(engine, provenance, cameras)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ import logging
 import os
 import signal
 import socket
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +40,16 @@ logger = logging.getLogger(__name__)
 class ServicePlan:
     """The model, the number of workers and the limits of a service.
 
-    `resolve` maps a model's name to its folder. `cameras`: the cameras that clients can name, by
-    name. `views`: number of views of each image whose answers are averaged.
+    `resolve` maps a model's name to its folder. `cameras` returns the cameras that clients can
+    name, by name, for the model in a folder; it raises UserError if a camera does not fit the
+    model. `views`: number of views of each image whose answers are averaged.
     """
 
     model: str
     resolve: Callable[[str], Path]
     workers: int
     limits: Limits
-    cameras: dict[str, CameraParameters] = field(default_factory=dict)
+    cameras: Callable[[Path], Mapping[str, CameraParameters]] = lambda _folder: {}
     views: int = 1
 
 
@@ -63,6 +64,7 @@ class Supervisor:
         self._head = self._shared.head()
         self._workers: dict[int, WorkerProcess] = {}  # by position, 0 to plan.workers - 1
         self._folder = plan.resolve(plan.model)
+        self._cameras = plan.cameras(self._folder)
         self._model = plan.model
         self._model_hash: str | None = None
         self._last_generation = 0  # number of the last reload, also if it failed
@@ -145,11 +147,17 @@ class Supervisor:
     async def reload(self, model: str | None = None) -> str:
         """Load `model` (None: the current model again) in all workers, then switch to it.
 
-        Returns the hash of the weights. Raises UserError; the old weights then stay in use.
+        The files of the cameras are read again, because values that a file omits come from the
+        model. Returns the hash of the weights. Raises UserError; the old weights and cameras then
+        stay in use.
         """
         async with self._change_lock:
             name = model or self._model
             folder = self._plan.resolve(name)
+            try:
+                cameras = self._plan.cameras(folder)
+            except UserError as error:
+                raise UserError(f"{error}; the old model stays in use") from error
             workers = [worker for worker in self._workers.values() if worker.alive]
             if not workers:
                 raise UserError("no worker is alive; workers are being restarted, try again")
@@ -157,8 +165,9 @@ class Supervisor:
             # for a report of the next reload.
             self._last_generation += 1
             generation = self._last_generation
+            sent = {name: camera.as_dict() for name, camera in cameras.items()}
             for worker in workers:
-                worker.send(load=str(folder.resolve()), generation=generation)
+                worker.send(load=str(folder.resolve()), generation=generation, cameras=sent)
             reports = await asyncio.gather(
                 *(worker.wait_loaded(generation, LOAD_TIMEOUT_S) for worker in workers),
                 return_exceptions=True,
@@ -172,6 +181,7 @@ class Supervisor:
             # After this assignment every worker answers with the new weights.
             self._head[COMMITTED_GENERATION] = generation
             self._folder, self._model, self._model_hash = folder, name, model_hash
+            self._cameras = cameras
             logger.info("now serving %s, model %s", folder, model_hash[:12])
             return model_hash
 
@@ -235,7 +245,7 @@ class Supervisor:
             blocks=self._shared.blocks,
             block=block,
             limits=self._plan.limits,
-            cameras=self._plan.cameras,
+            cameras=self._cameras,
             views=self._plan.views,
         )
         return await start_worker(task)

@@ -10,6 +10,7 @@ import socket
 import sys
 import time
 from asyncio.subprocess import Process
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -39,7 +40,7 @@ class WorkerTask:
     blocks: int
     block: int
     limits: Limits
-    cameras: dict[str, CameraParameters] = field(default_factory=dict)
+    cameras: Mapping[str, CameraParameters] = field(default_factory=dict)
     views: int = 1
 
     def to_json_line(self) -> bytes:
@@ -50,9 +51,13 @@ class WorkerTask:
     def from_json_line(cls, line: str) -> "WorkerTask":
         """Read the task from a line of JSON."""
         content = json.loads(line)
-        cameras = {name: CameraParameters(**each) for name, each in content["cameras"].items()}
-        limits = Limits(**content["limits"])
+        limits, cameras = Limits(**content["limits"]), read_cameras(content["cameras"])
         return cls(**{**content, "limits": limits, "cameras": cameras})
+
+
+def read_cameras(content: dict[str, dict[str, Any]]) -> dict[str, CameraParameters]:
+    """Return the cameras in a message of the supervisor, by name."""
+    return {name: CameraParameters(**values) for name, values in content.items()}
 
 
 class WorkerProcess:

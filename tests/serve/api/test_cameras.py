@@ -1,7 +1,11 @@
 """Named cameras of the service: every endpoint gives the same answers as `mtlnet predict`."""
 
 import json
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +19,18 @@ from serve.client import Client, ServiceError
 from serve.config import Limits
 from serve.workers.worker_process import WorkerTask
 from tests.serve.api.test_options import WIDE, features, infer, post, stream
-from tests.serve.conftest import CARD, JPEG, PATIENCE_S, FakeEngine, Served, outputs, serving
+from tests.serve.conftest import (
+    CARD,
+    JPEG,
+    PATIENCE_S,
+    FakeEngine,
+    Gate,
+    Served,
+    constant_engine,
+    outputs,
+    serving,
+    until,
+)
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -63,6 +78,29 @@ def test_every_endpoint_takes_it(service: Served) -> None:
     assert stream(service, "?camera=roof", '{"fov_y": 67.5}')["distances_m"]["ml"] == pytest.approx(
         -2
     )
+
+
+def test_cameras_change_together_with_the_model() -> None:
+    """An image that waits during a reload is answered with the new model's cameras."""
+    high, gate, committed = replace(ROOF, z=1.75), Gate(), threading.Event()
+    expected = decode_outputs(Rectification(high, MODEL).outputs(outputs()[None])[0])
+    with (
+        serving(gate.engine, cameras={"roof": ROOF}) as service,
+        ThreadPoolExecutor(2) as pool,
+    ):
+        ask = partial(features, query="?camera=roof")
+        first = pool.submit(ask, Served(service.port))
+        assert gate.busy.wait(PATIENCE_S)
+        queue = service.app.frame_queue
+        queue.stage_model(constant_engine(), {"roof": high}, committed.is_set)
+        second = pool.submit(ask, Served(service.port))
+        until(lambda: queue.waiting == 1)
+        committed.set()
+        gate.open.set()
+        answers = [reply.result().content["distances_m"] for reply in (first, second)]
+        assert answers == [pytest.approx(EXPECTED.distances_m), pytest.approx(expected.distances_m)]
+        model = service.ask("GET", "/model").content
+        assert model["cameras"]["roof"]["z"] == 1.75
 
 
 def test_an_unknown_camera_is_refused(service: Served, engine: FakeEngine) -> None:

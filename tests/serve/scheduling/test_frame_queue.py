@@ -41,7 +41,7 @@ def test_reading_the_engine_changes_no_state() -> None:
     """The event loop reads `loaded` while the engine's thread works."""
     queue = make_queue(constant_engine())
     new = constant_engine()
-    queue.stage_model(new, lambda: True)
+    queue.stage_model(new, {}, lambda: True)
     before = dict(vars(queue))
     assert queue.loaded.engine is new
     assert vars(queue) == before
@@ -50,12 +50,12 @@ def test_reading_the_engine_changes_no_state() -> None:
 def test_a_committed_engine_is_kept_when_another_is_staged_or_dropped() -> None:
     queue = make_queue(constant_engine())
     committed, next_one = constant_engine(), constant_engine()
-    queue.stage_model(committed, lambda: True)
-    queue.stage_model(next_one, lambda: False)
+    queue.stage_model(committed, {}, lambda: True)
+    queue.stage_model(next_one, {}, lambda: False)
     assert queue.loaded.engine is committed
     queue.drop_staged_model()
     assert queue.loaded.engine is committed
-    queue.stage_model(next_one, lambda: True)
+    queue.stage_model(next_one, {}, lambda: True)
     queue.drop_staged_model()
     assert queue.loaded.engine is next_one
 

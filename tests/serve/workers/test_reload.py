@@ -1,5 +1,6 @@
 """Reload and restart of a running service: no request is lost and no answer is wrong."""
 
+import json
 import os
 import shutil
 import signal
@@ -126,6 +127,35 @@ def test_reload_and_restart_lose_no_request_and_give_no_wrong_answer(
             assert {key: answer[key] for key in right} == right
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
+
+
+def test_a_reload_reads_the_cameras_again_for_the_new_model(
+    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The camera's file has no height, so the height is that of the model's camera."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    high, card = tmp_path / "high", json.loads((published / "card.json").read_text())
+    shutil.copytree(published, high)
+    high_camera = {**card["camera"], "z": card["camera"]["z"] + 0.6}
+    (high / "card.json").write_text(json.dumps({**card, "camera": high_camera}))
+    roof = tmp_path / "roof.yaml"
+    roof.write_text("width: 280\nheight: 210\nfov_y_deg: 67.5\nyaw_deg: 2\n")
+    arguments = ("--model", str(published), "--port", "0", "--camera", f"roof={roof}")
+    with started(*arguments) as (_process, line), Client(address(line)) as client:
+        client.wait_until_ready(PATIENCE_S)
+        port = address(line).rpartition(":")[2]
+
+        def height_m() -> Any:
+            return client.model()["cameras"]["roof"]["z"]
+
+        assert height_m() == card["camera"]["z"]
+        done = run("reload", "--port", port, "--model", str(high))
+        assert done.returncode == 0, done.stderr
+        assert height_m() == high_camera["z"]
+        roof.write_text("fov_y_deg: 10\n")
+        done = run("reload", "--port", port, "--model", str(published))
+        assert (done.returncode, height_m()) == (1, high_camera["z"])
+        assert "the old model stays in use" in done.stderr
 
 
 def children(pid: int) -> list[int]:

@@ -16,6 +16,7 @@ from serve.workers import supervisor as module
 from serve.workers.supervisor import ServicePlan, Supervisor
 from serve.workers.worker_process import WorkerProcess, WorkerTask
 from tests.serve.conftest import PATIENCE_S
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 
@@ -42,6 +43,8 @@ class FakeWorkers:
     def __init__(self) -> None:
         self.started: list[WorkerProcess] = []
         self.failing_folders: set[str] = set()
+        self.cameras: list[Any] = []
+        """The cameras in the messages for a reload."""
         self.is_ready = True
         self.is_loading = False
         """Whether the workers never finish loading."""
@@ -75,6 +78,7 @@ class FakeWorkers:
             message = json.loads(line)
             if "load" not in message:
                 continue
+            self.cameras.append(message["cameras"])
             if message["load"] in self.failing_folders:
                 send(failed=message["generation"], why="the weights are damaged")
             else:
@@ -142,6 +146,32 @@ def test_a_reload_after_a_failed_reload_loads_the_model(
         assert supervisor.folder == tmp_path / "good"
 
     asyncio.run(scenario())
+
+
+def test_a_reload_reads_the_cameras_again_for_the_new_model(
+    workers: FakeWorkers, tmp_path: Path
+) -> None:
+    heights = {"run": 0.95, "high": 1.55}
+
+    def cameras(folder: Path) -> dict[str, CameraParameters]:
+        if folder.name not in heights:
+            raise UserError("roof.yaml: with this camera the image shows too little")
+        return {"roof": CameraParameters(z=heights[folder.name])}
+
+    async def scenario() -> None:
+        plan = ServicePlan("run", lambda name: tmp_path / name, 2, Limits(), cameras)
+        supervisor = Supervisor(plan, [bind("127.0.0.1", 0)])
+        await supervisor.start()
+        with pytest.raises(UserError, match="shows too little; the old model stays in use"):
+            await supervisor.reload("narrow")
+        await supervisor.restart()
+        await supervisor.reload("high")
+        await supervisor.restart()
+
+    asyncio.run(scenario())
+    sent = [worker.task.cameras["roof"].z for worker in workers.started]
+    assert sent == [0.95] * 4 + [1.55] * 2
+    assert workers.cameras == [{"roof": CameraParameters(z=1.55).as_dict()}] * 2
 
 
 def test_a_replacement_that_does_not_become_ready_is_stopped(
