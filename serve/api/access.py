@@ -75,8 +75,9 @@ class Access:
             )
 
     def _refuse(self, problem: Problem, headers: Headers, client: str, path: str = "") -> Reply:
-        self._count_refusal(problem, request_id_of(headers), client)
-        return problem_reply(problem, path=path)
+        request_id = request_id_of(headers)
+        self._count_refusal(problem, request_id, client)
+        return problem_reply(problem, (b"x-request-id", request_id.encode()), path=path)
 
 
 class HostCheck:

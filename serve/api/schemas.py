@@ -218,7 +218,6 @@ def features_operation() -> dict[str, Any]:
             "200": {
                 "description": "The track features, in the media type preferred by `Accept`",
                 "content": {form.media_type: {"schema": schema} for form in FORMATS},
-                "headers": {REQUEST_ID: {"schema": NAME}},
             },
             **{str(k): v for k, v in problem_responses(*REFUSALS).items()},
         },
@@ -249,6 +248,14 @@ def add_common_responses(operation: dict[str, Any], needs_token: bool) -> None:
         if own is not None:
             response["description"] = f"{own['description']}; {response['description']}"
         responses[str(status)] = response
+
+
+def _add_request_id(responses: dict[str, Any]) -> None:
+    """Add the header X-Request-Id to all `responses` of an operation."""
+    sent = {"description": "The request's id.", "schema": NAME}
+    for status, response in responses.items():
+        headers = {**response.get("headers", {}), REQUEST_ID: sent}
+        responses[status] = {**response, "headers": headers}
 
 
 def install_openapi(app: FastAPI, public: Collection[str], token_required: bool) -> None:
@@ -285,5 +292,7 @@ def _complete(schema: dict[str, Any], public: Collection[str], token_required: b
     for path, item in schema["paths"].items():
         for operation in item.values():
             add_common_responses(operation, path not in public)
+            if any(each["name"] == REQUEST_ID for each in operation.get("parameters", ())):
+                _add_request_id(operation["responses"])
             if token_required and path not in public:
                 operation["security"] = [{"token": []}]

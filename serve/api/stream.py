@@ -3,7 +3,7 @@
 A binary message is one image. Its answer is a text message with JSON, or with the subprotocol
 `driverview.msgpack` a binary message with MessagePack. A new frame replaces a queued frame of the
 same WebSocket. A text message before an image is a JSON object with options of this image:
-`frame_id`, `deadline_ms`, `fov_y`, `camera`. Options for all images are sent with the handshake, as
+`frame_id`, `deadline_ms`, `fov_y`, `camera`; a second one before the same image is refused. Options for all images are sent with the handshake, as
 headers (e.g. X-Camera-Fov-Y) or, from a browser, in the query. A refused frame is answered with its
 problem and its frame_id; the WebSocket stays open.
 """
@@ -79,31 +79,32 @@ class Stream:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         await receive()  # websocket.connect
         request_id = request_id_of(dict(scope["headers"]))
+        headers = [(b"x-request-id", request_id.encode())]
         try:
             options = _parse_handshake(scope, request_id)
         except Problem as error:
             problem = self._frames.record_refusal(error, request_id, client_address(scope))
-            await send_reply(send, problem_reply(problem), "websocket.http")
+            await send_reply(send, problem_reply(problem, *headers), "websocket.http")
             return
-        headers = [(b"x-request-id", request_id.encode())]
         accept = {"type": "websocket.accept", "subprotocol": options.protocol, "headers": headers}
         await send(accept)
         await self._receive_frames(options, receive, send)
 
     async def _receive_frames(self, options: StreamOptions, receive: Receive, send: Send) -> None:
         pending: set[asyncio.Task[None]] = set()
-        number, metadata = 0, ""
+        number = 0
+        texts: tuple[str, ...] = ()
         while (message := await receive())["type"] == "websocket.receive":
             if message.get("bytes") is None:
                 # Cut, so that an idle client keeps no megabytes in memory.
-                metadata = message["text"][: MAX_TEXT + 1]
+                texts = (*texts[:1], message["text"][: MAX_TEXT + 1])
                 message.clear()
                 continue
             number += 1
             stamp_ns = time.monotonic_ns()
-            answer = self._answer(options, stamp_ns, str(number), metadata, message, send)
+            answer = self._answer(options, stamp_ns, str(number), texts, message, send)
             task = asyncio.ensure_future(answer)
-            metadata = ""
+            texts = ()
             pending.add(task)
             task.add_done_callback(pending.discard)
             await asyncio.sleep(0)  # queue this frame before the next one is received
@@ -120,7 +121,7 @@ class Stream:
         stream: StreamOptions,
         stamp_ns: int,
         number: str,
-        metadata: str,
+        texts: tuple[str, ...],
         message: Message,
         send: Send,
     ) -> None:
@@ -128,7 +129,7 @@ class Stream:
         client must not keep its image in memory.
 
         `stamp_ns`: time of arrival, ns of the monotonic clock. `number`: number of the image in its
-        WebSocket, from 1. `metadata`: text message with options of the image, or empty.
+        WebSocket, from 1. `texts`: the first two text messages before the image.
         """
         request_id = f"{stream.defaults.request_id}/{number}"
         frame_id = stream.defaults.frame_id or number
@@ -136,7 +137,7 @@ class Stream:
         try:
             share.grow(len(message["bytes"]))
             self._rate_limiter.check(stream.client)
-            headers = _parse_metadata(metadata)
+            headers = _parse_texts(texts)
             frame_id = parse_name(headers.get(KEYS["frame_id"]), FRAME_ID) or frame_id
             deadline_ms = headers.get(KEYS["deadline_ms"], stream.deadline_ms)
             fov_deg = parse_fov_deg(headers.get(KEYS["fov_y"]))
@@ -187,10 +188,15 @@ def _parse_handshake(scope: Scope, request_id: str) -> StreamOptions:
     return StreamOptions(options, protocol, headers.get(KEYS["deadline_ms"]), client_address(scope))
 
 
-def _parse_metadata(text: str) -> Headers:
-    """Parse the options of an image in a text message; return them as headers. Raises Problem."""
-    if not text:
+def _parse_texts(texts: tuple[str, ...]) -> Headers:
+    """Parse the options in the text messages before an image; return them as headers. Raises
+    Problem, also for a second text message, because options of the first one could be lost."""
+    if not texts:
         return {}
+    if len(texts) > 1:
+        seen = "more than one text message precedes the image; send all its options in one message"
+        raise Problem(INVALID_REQUEST, seen)
+    (text,) = texts
     metadata = parse_json_object(text, "a text message") if len(text) <= MAX_TEXT else None
     if metadata is None:
         raise Problem(

@@ -11,7 +11,7 @@ import pytest
 
 import trackfeatures as tf
 from serve.api.schemas import Features
-from serve.config import MAX_BODY_BYTES
+from serve.config import MAX_BODY_BYTES, Limits
 from tests.serve.conftest import (
     CARD,
     JPEG,
@@ -23,8 +23,23 @@ from tests.serve.conftest import (
     outputs,
     picture,
     png,
+    serving,
     until,
 )
+
+
+@pytest.mark.parametrize(("method", "path"), [("POST", "/features"), ("GET", "/model")])
+def test_a_request_that_is_refused_early_keeps_its_id(method: str, path: str) -> None:
+    with serving(limits=Limits(token="0123456789abcdef", rate=1.0)) as service:
+        for headers, status in (
+            ({}, 401),
+            ({"Origin": "https://evil.example"}, 403),
+            ({"X-Forwarded-For": "203.0.113.1"}, 401),
+            ({"X-Forwarded-For": "203.0.113.1"}, 429),
+        ):
+            reply = service.ask(method, path, None, {**headers, "X-Request-Id": "mine"})
+            assert (reply.status, reply.headers["x-request-id"]) == (status, "mine")
+        assert service.ask(method, path).headers["x-request-id"]
 
 
 def test_the_answer_holds_the_engines_outputs(service: Served) -> None:

@@ -86,6 +86,9 @@ def test_the_document_lists_every_operation_and_refusal(running: Served) -> None
         good = {"application/json", "application/msgpack"}
         kinds = good if status == "200" else {"application/problem+json"}
         assert set(response["content"]) == kinds
+    for path in ("/features", "/v2/models/track/infer"):
+        for response in document["paths"][path]["post"]["responses"].values():
+            assert "X-Request-Id" in response["headers"]
     assert "HTTPValidationError" not in document["components"]["schemas"]
     kinds = document["components"]["schemas"]["ProblemDetails"]["properties"]["type"]["enum"]
     assert "/problems/not-an-image" in kinds

@@ -56,6 +56,21 @@ def test_each_frame_is_answered_as_over_http(service: Served) -> None:
         assert read(socket)["frame_id"] == "11"
 
 
+def test_an_image_after_two_text_messages_is_refused(service: Served) -> None:
+    """The options of one of the two messages would be lost."""
+    with dial(service) as socket:
+        for texts in (['{"fov_y": 90}', '{"frame_id": "mine"}'], ["", '{"fov_y": 90}'], ["{}"] * 3):
+            for text in texts:
+                socket.send(text)
+            socket.send(JPEG)
+            problem = read(socket)
+            assert problem["type"] == "/problems/invalid-request"
+            assert "more than one text message" in problem["detail"]
+        socket.send('{"frame_id": "mine"}')
+        socket.send(JPEG)
+        assert read(socket)["frame_id"] == "mine"
+
+
 def test_messagepack_by_subprotocol_and_options_by_query(service: Served) -> None:
     protocol = Subprotocol("driverview.msgpack")
     with dial(service, "/stream?fov_y=90", subprotocols=[protocol]) as socket:
@@ -94,10 +109,11 @@ def test_a_refusal_at_the_handshake() -> None:
             ("/stream?fov_y=0", token, 422, "invalid-request"),
         ):
             with pytest.raises(InvalidStatus) as caught:
-                dial(service, path, additional_headers=headers)
+                dial(service, path, additional_headers={**headers, "X-Request-Id": "mine"})
             response = caught.value.response
             assert response.status_code == status
             assert json.loads(response.body or b"")["type"] == f"/problems/{name}"
+            assert response.headers["X-Request-Id"] == "mine"
         same = {**token, "Origin": service.url}
         with dial(service, additional_headers=same) as socket:
             socket.send(JPEG)
