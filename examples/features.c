@@ -22,6 +22,8 @@
 #include <time.h>
 #include <unistd.h>
 
+#define BLANKS " \t\n\v\f\r"
+
 enum { MAX_IMAGE = 4 << 20, MAX_ANSWER = 64 << 10, WAIT_S = 5, GIVE_UP_S = 10 };
 
 struct answer {
@@ -148,16 +150,21 @@ static void receive(int connection, struct answer *answer)
 
 static void ask(int connection, const char *host, const char *image, size_t length, struct answer *answer)
 {
-    const char *token = getenv("DRIVERVIEW_TOKEN");
+    const char *set = getenv("DRIVERVIEW_TOKEN");
+    const char *token = set ? set + strspn(set, BLANKS) : "";
+    size_t token_length = strlen(token); /* without the blanks around it, like a token in a file */
+    while (token_length > 0 && strchr(BLANKS, token[token_length - 1]))
+        token_length--;
     const int png = length > 4 && memcmp(image, "\x89PNG", 4) == 0;
     const int ipv6 = strchr(host, ':') != NULL; /* in brackets, without its zone */
     char head[1024];
     int size = snprintf(head, sizeof head,
                         "POST /features HTTP/1.1\r\nHost: %s%.*s%s\r\nContent-Type: image/%s\r\n"
-                        "Accept: application/json\r\nContent-Length: %zu\r\n%s%s%s\r\n",
+                        "Accept: application/json\r\nContent-Length: %zu\r\n%s%.*s%s\r\n",
                         ipv6 ? "[" : "", (int)(ipv6 ? strcspn(host, "%") : strlen(host)), host,
-                        ipv6 ? "]" : "", png ? "png" : "jpeg", length, token ? "Authorization: Bearer " : "",
-                        token ? token : "", token ? "\r\n" : "");
+                        ipv6 ? "]" : "", png ? "png" : "jpeg", length,
+                        token_length ? "Authorization: Bearer " : "", (int)token_length, token,
+                        token_length ? "\r\n" : "");
     answer->status = 0;
     if (size < 0 || (size_t)size >= sizeof head) {
         fprintf(stderr, "the host's name or the token is too long\n");

@@ -80,8 +80,11 @@ def test_absent_markings_are_printed_and_a_token_is_sent(program: Path, image: P
     engine = FakeEngine(lambda _image: outputs((nan, nan, -3.0, 0.5, 4.0), angle=-0.2))
     with serving(engine, limits=Limits(token="0123456789abcdef")) as service:
         assert "status 401" in ask(program, service.port, image).stderr
-        done = ask(program, service.port, image, token="0123456789abcdef")
-    assert "ml absent mr absent angle -0.2000 rad class straight" in done.stdout
+        for token in ("0123456789abcdef", " 0123456789abcdef\r\n"):
+            done = ask(program, service.port, image, token=token)
+            assert "ml absent mr absent angle -0.2000 rad class straight" in done.stdout
+        for token in ("", " \n"):
+            assert "status 401" in ask(program, service.port, image, token=token).stderr
 
 
 def test_a_busy_service_is_asked_again(program: Path, image: Path) -> None:
