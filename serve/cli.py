@@ -77,7 +77,7 @@ RequestRate = Annotated[
     float,
     typer.Option(
         help="Largest number of requests per second from one client (an IPv4 address or an "
-        "IPv6 /64 network). Requests from this machine are not limited. 0: no limit.",
+        "IPv6 /64 network). Requests from a loopback address (127.0.0.1, ::1) are not limited. 0: no limit.",
         min=0,
     ),
 ]

@@ -17,7 +17,7 @@ from serve.shared_memory import CLIENT_ENTRIES, CLIENT_WORDS, PROBES
 @lru_cache(4096)
 def client_key(address: str, public: bool = False) -> float:
     """Return the key of a client address in the table of buckets: an integer above 0 that a float
-    holds exactly; 0.0 for this machine.
+    holds exactly; 0.0 for a loopback address and for an unknown address.
 
     All addresses of an IPv6 /64 network have the same key. `public` gives another key, for the
     bucket of paths that need no token.
