@@ -77,14 +77,19 @@ RequestRate = Annotated[
     float,
     typer.Option(
         help="Largest number of requests per second from one client (an IPv4 address or an "
-        "IPv6 /64 network). Requests from a loopback address (127.0.0.1, ::1) are not limited. 0: no limit.",
+        "IPv6 /64 network). Requests from a loopback address (127.0.0.1, ::1) are not limited. "
+        "0: no limit.",
         min=0,
     ),
 ]
 Connections = Annotated[
     int,
     typer.Option(
-        help="Largest number of open connections of all clients together.", min=1, max=65536
+        help="Largest number of open connections of all clients together. Beyond it a new "
+        "connection ends an old one, of a client with at least as many connections in the same "
+        "worker process.",
+        min=1,
+        max=65536,
     ),
 ]
 AllowHost = Annotated[

@@ -5,6 +5,7 @@ waited longest is first. If the number of connections is at its limit, a new con
 one, in this order: refused connections that still read, requests that arrive slowly, idle
 connections (first those without an answered image), WebSockets without messages. A new connection
 never ends a connection of a client that has fewer connections than the new connection's client.
+Only the connections of this worker are counted.
 """
 
 import time
@@ -106,7 +107,7 @@ class ConnectionGuard:
     closing: Group = field(default_factory=_group)
     """Ended connections that the server still counts for a moment."""
     open: Counter[str] = field(default_factory=Counter)
-    """Number of connections of each client's network."""
+    """Number of connections of each client's network in this worker."""
     paused: list[HttpToolsProtocol] = field(default_factory=list)
     """Connections that are not read for REFUSAL_PAUSE_S; see `pause_reading`."""
 
@@ -191,8 +192,8 @@ class ConnectionGuard:
         return ended
 
     def _count(self, connection: Guarded) -> int:
-        """The number of connections of this connection's client. Behind a trusted proxy it is 1,
-        because each connection can belong to a different client."""
+        """The number of connections of this connection's client in this worker. Behind a trusted
+        proxy it is 1, because each connection can belong to a different client."""
         return self.open[connection.network] if connection.network else 1
 
     def end_slow_bodies(self, size: float) -> float:
