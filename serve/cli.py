@@ -223,6 +223,8 @@ def ray(
     token_file: TokenFile = None,
     insecure: Insecure = False,
     allow_host: AllowHost = None,
+    camera: CameraFiles = None,
+    views: command.Views = 1,
 ) -> None:
     """Serve a model over HTTP with Ray Serve.
 
@@ -241,7 +243,7 @@ def ray(
             f"Ray Serve is not installed ({error}): pip install 'driverview[rayserve]'"
         ) from error
     limits = Limits(token=token, hosts=(host, *(allow_host or ())))
-    run(RayConfig(model, host, port, replicas, limits))
+    run(RayConfig(model, host, port, replicas, limits, tuple(camera or ()), views))
 
 
 def main() -> None:

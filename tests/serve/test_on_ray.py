@@ -9,15 +9,19 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
+from typer.testing import CliRunner
 
 from mtlnet.inference.engine import load_engine
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import read_card
 from mtlnet.inference.prediction import decode_outputs
 from runtime.sockets import bind
-from serve.cli import main
+from serve.cameras import read_cameras
+from serve.cli import app, main
 from serve.config import Limits
 from tests.serve.conftest import PATIENCE_S, Reply, Served, png
 from tests.serve.test_cli import ROOT, command
@@ -100,7 +104,7 @@ def test_the_builder_asks_for_the_token(
 ) -> None:
     on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
     bound: list[Limits] = []
-    monkeypatch.setattr(on_ray_module, "_bind", lambda _run, _count, limits: bound.append(limits))
+    monkeypatch.setattr(on_ray_module, "_bind", lambda config: bound.append(config.limits))
     model = {"model": str(published)}
     on_ray_module.build(model)
     monkeypatch.setenv("DRIVERVIEW_TOKEN", TOKEN)
@@ -114,6 +118,31 @@ def test_the_builder_asks_for_the_token(
     monkeypatch.setenv("DRIVERVIEW_TOKEN", "short")
     with pytest.raises(UserError, match="must be 16 or more"):
         on_ray_module.build(model)
+
+
+def test_cameras_and_views_reach_the_replicas(
+    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
+    deployed: list[Any] = []
+    take = MagicMock(side_effect=lambda found: deployed.append(found) or MagicMock())
+    monkeypatch.setattr(on_ray_module.ray_serve, "ingress", take)
+    monkeypatch.setattr(on_ray_module.ray_serve, "deployment", lambda **_: MagicMock())
+    monkeypatch.delenv("DRIVERVIEW_TOKEN", raising=False)
+    roof = tmp_path / "roof.yaml"
+    roof.write_text("width: 280\nheight: 210\nfov_y_deg: 67.5\nyaw_deg: 2\n")
+    model, cameras = ["--model", str(published)], [f"roof={roof}"]
+    monkeypatch.setattr(on_ray_module, "run", on_ray_module._bind)
+    words = ["ray", *model, "--camera", cameras[0], "--views", "2"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    on_ray_module.build({"model": str(published), "cameras": cameras, "views": "2"})
+    for application in deployed:
+        loaded = application().frame_queue.loaded
+        assert loaded.cameras == read_cameras(cameras, loaded.view)
+        assert loaded.engine.views.count == 2
+    for wrong, said in (({"views": 3}, "give 1, 2 or 6"), ({"cameras": "roof"}, "give NAME=FILE")):
+        with pytest.raises(UserError, match=said):
+            on_ray_module.build({"model": str(published), **wrong})
 
 
 def test_the_builder_refuses_unknown_options(published: Path) -> None:
