@@ -66,8 +66,8 @@ async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
 
 
 def _cameras(options: tuple[str, ...], run: Path) -> dict[str, CameraParameters]:
-    """Read the cameras of `--camera` for the model in the folder `run`. Raises UserError, also for a
-    camera that does not show enough of the model's view."""
+    """Read the cameras of `--camera` for the model in the folder `run`. Raises UserError, also if a
+    camera does not show enough of the model's view."""
     if not options:
         return {}
     from serve.cameras import read_cameras  # imported late: loading OpenCV delays the workers

@@ -3,9 +3,10 @@
 
 The supervisor sends the WorkerTask first. For a reload it sends {"load": folder, "generation": n,
 "cameras": {name: camera}}; the cameras replace the old ones together with the weights. If the
-reload fails in any worker, it sends {"drop": n}, and both are discarded. The worker sends {"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why":
-...} for each generation n of weights, and {"ready": true} once it can answer images. When the
-supervisor closes the socket, the worker stops.
+reload fails in any worker, it sends {"drop": n}, and both are discarded. The worker sends
+{"loaded": n, "model": hash, "engine": ..., "precision": ...} or {"failed": n, "why": ...} for each
+generation n of weights, and {"ready": true} once it can answer images. When the supervisor closes
+the socket, the worker stops.
 """
 
 import gc

@@ -3,9 +3,9 @@
 A binary message is one image. Its answer is a text message with JSON, or with the subprotocol
 `driverview.msgpack` a binary message with MessagePack. A new frame replaces a queued frame of the
 same WebSocket. A text message before an image is a JSON object with options of this image:
-`frame_id`, `deadline_ms`, `fov_y`, `camera`; a second one before the same image is refused. Options for all images are sent with the handshake, as
-headers (e.g. X-Camera-Fov-Y) or, from a browser, in the query. A refused frame is answered with its
-problem and its frame_id; the WebSocket stays open.
+`frame_id`, `deadline_ms`, `fov_y`, `camera`; a second one before the same image is refused. Options
+for all images are sent with the handshake, as headers (e.g. X-Camera-Fov-Y) or, from a browser, in
+the query. A refused frame is answered with its problem and its frame_id; the WebSocket stays open.
 """
 
 import asyncio
