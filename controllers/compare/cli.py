@@ -65,8 +65,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from controllers.compare.report import score_table
-    from controllers.compare.run import groups
+    from controllers.compare.report import groups, score_table
 
     console = Console()
     console = Console(width=max(console.width, TERMINAL_WIDTH))

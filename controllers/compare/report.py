@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from controllers.compare.run import REPORT, groups
+from controllers.compare.run import REPORT
 from controllers.drive.run import SCORED_STEPS
 from runtime.files import atomic_write
 from runtime.html import render
@@ -150,3 +150,11 @@ def _results(drives: list[dict[str, Any]], track: str, controller: str) -> list[
         for entry in drives
         if (entry["track"], entry["controller"]) == (track, controller)
     ]
+
+
+def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
+    """Yield ((perception, disturbance), drives) for the drives in a result of `compare`."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for entry in content["drives"]:
+        found.setdefault((entry["perception"], entry["disturbance"]), []).append(entry)
+    yield from found.items()

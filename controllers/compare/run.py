@@ -16,6 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from controllers import laws
 from controllers.compare.config import CompareConfig
 from controllers.compare.curves import CurveRecorder, curves_of
 from controllers.drive.config import DriveConfig
@@ -23,7 +24,7 @@ from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
 from controllers.drive.many import Outcome, Task, can_join, drive_many
 from controllers.drive.run import GRID_SHARE, drive, read_parameters
 from controllers.interface import LoopConfig
-from controllers.laws.actor import SHIPPED, WEIGHTS, is_actor
+from controllers.laws.actor import CARD, SHIPPED, WEIGHTS, is_actor
 from controllers.perception.sources import ServiceModel, check_perception
 from controllers.registry import CONTROLLERS, make_controller
 from runtime.files import locked_folder, write_json
@@ -34,6 +35,7 @@ from trackfeatures.errors import UserError
 
 VERSION = 3
 """Version of `results.json`."""
+LAWS = Path(laws.__file__).parent
 RESULTS, REPORT = "results.json", "report.html"
 SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "views", "light")
 """Names of the options of a comparison that are equal for all drives in a `results.json`."""
@@ -259,7 +261,7 @@ def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
     """Return, for each drive, a hash of the inputs that its cell does not contain: the tuned
     parameters, the road, the controller's files, and the weights of the model."""
     tracks = {
-        name: find_track(name, config.tracks_dir).content_hash.encode()
+        name: find_track(name, config.tracks_dir).driving_hash.encode()
         for name in dict.fromkeys(cell.track for cell in todo)
     }
     parameters, files = {}, {}
@@ -285,14 +287,14 @@ def _model_of(config: CompareConfig, perception: str) -> str:
 
 
 def _files_of(controller: str) -> list[Path]:
-    """Return the paths of a controller's files: the module of a controller of this project and its
-    weights, if it has any; the weights of a trained actor; or the file of a user's class."""
+    """Return the paths of a controller's files: all modules of `controllers.laws` and its trained
+    actor, if it has one, for a controller of this project; the files of a trained actor; or the
+    file of a user's class."""
     if controller in CONTROLLERS:
-        module = CONTROLLERS[controller].factory.partition(":")[0]
-        weights = SHIPPED / controller / WEIGHTS
-        return [Path(str(import_module(module).__file__)), *filter(Path.is_file, [weights])]
+        actor = [SHIPPED / controller / name for name in (CARD, WEIGHTS)]
+        return [*sorted(LAWS.glob("*.py")), *filter(Path.is_file, actor)]
     if is_actor(Path(controller)):
-        return [Path(controller) / WEIGHTS]
+        return [Path(controller) / name for name in (CARD, WEIGHTS)]
     place = controller.rpartition(":")[0]
     return [Path(place if place.endswith(".py") else str(import_module(place).__file__))]
 
@@ -345,11 +347,3 @@ def _report_driven(report: Report, before: int, name: str, driven: float) -> Non
 def _report_share(report: Report, done: int, name: str, step: int, steps: int) -> None:
     if step % 50 == 0:
         report(done + step / steps, name)
-
-
-def groups(content: dict[str, Any]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
-    """Yield ((perception, disturbance), drives) for the drives in a result of `compare`."""
-    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for entry in content["drives"]:
-        found.setdefault((entry["perception"], entry["disturbance"]), []).append(entry)
-    yield from found.items()

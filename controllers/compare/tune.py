@@ -143,7 +143,7 @@ def evaluate(config: TuneConfig, controller: str, parameters: Mapping[str, float
 def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
     settings: dict[str, Any] = {name: getattr(config, name) for name in SETTINGS}
     settings["roads"] = [
-        find_track(name, config.tracks_dir).content_hash for name in names(config.tracks, "tracks")
+        find_track(name, config.tracks_dir).driving_hash for name in names(config.tracks, "tracks")
     ]
     if not path.exists():
         return {"version": VERSION, "settings": settings, "controllers": {}}

@@ -248,6 +248,7 @@ class _Batch:
             laps_begun=int(row[LAP]),
             distance_m=float(row[MEMORY_AT + ODOMETER]),
             blind_steps=min(delay, driven),
+            noisy=ride.disturbance.noise,
         ).result(ride.steps, ride.road, centre, FREQUENCY_HZ)
         return Outcome(ride.number, result, curves)
 

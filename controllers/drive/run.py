@@ -120,7 +120,7 @@ def drive(
             steps,
             pedals=pedals,
             lane_centre=lane.centre,
-            noisy=loop.noisy,
+            noisy=loop.noisy or disturbance.noise or bool(config.latency_ms or config.drop),
             record=_recorder(perceive, watching, steps, progress),
         )
         return result if live is None else replace(result, real_time=live.figures())

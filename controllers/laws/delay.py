@@ -96,7 +96,7 @@ def update_delay(memory: Any, theta: float, yaw_rate: float, dt: float) -> bool:
         span = SPANS[i]
         for k in range(MAX_DELAY + 1):
             second = residuals[0, k] - 2.0 * residuals[span, k] + residuals[2 * span, k]
-            memory.squares[i, count % WINDOW, k] = second * second
+            memory.squares[i, (count - 1) % WINDOW, k] = second * second
     before = memory.steps
     if count >= FEWEST:
         for i in range(len(SPANS)):

@@ -56,6 +56,10 @@ class StatePredictor:
         seen = Observation(0.0, 0.0, heading, now.vx, now.vy, now.yaw_rate)
         self._moments.append(_Moment(now.vx, now.vy, now.yaw_rate, self._curvature(seen)))
 
+    def reaches(self, age: int) -> bool:
+        """Whether the motion since `age` control steps ago is stored."""
+        return age < len(self._moments)
+
     def predict(self, answer: Perceived, age: int, until: int = 0) -> Perceived:
         """Return `answer` predicted from the moment of its image, `age` control steps ago, to the
         moment `until` control steps ago."""
@@ -107,7 +111,8 @@ class RoadEstimate:
         if self._predictor is None:
             return arrived
         steps, known = self._age - age, None
-        if self._last is not None and steps * self.dt <= LOST_S:
+        reached = self._predictor.reaches(self._age)
+        if self._last is not None and steps * self.dt <= LOST_S and reached:
             known = self._predictor.predict(self._last, self._age, until=age)
         return self._trust.correct(known, arrived, steps, steps * self.dt * speed)
 

@@ -99,12 +99,14 @@ class Agent:
             value -= of.reward_baseline * of.discount / (1.0 - of.discount)
         self.replay.add(seen, action, of.reward_scale * value, next_seen, ended)
 
-    def act_all(self, seen: Array) -> Array:
-        """Return the actions (N,) of the present actor for inputs (N, size) of the networks."""
+    def act_all(self, seen: Array, *, target: bool = False) -> Array:
+        """Return the actions (N,) of the present actor, or with `target` of the target actor, for
+        inputs (N, size) of the networks."""
         rows = seen
         if self.algorithm.mirrored:
             rows = np.concatenate((seen, seen[:, self._order] * self._signs))
-        actions: Array = np.tanh(forward(self.actor.layers, rows).out[0])
+        of = layers(self.actor.target, self.shape) if target else self.actor.layers
+        actions: Array = np.tanh(forward(of, rows).out[0])
         return (
             0.5 * (actions[: len(seen)] - actions[len(seen) :])
             if len(rows) > len(seen)

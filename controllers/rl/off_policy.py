@@ -31,8 +31,9 @@ class OffPolicy:
         self.divisor, self.odd = self._agent.divisor, algorithm.mirrored
 
     def act(self, states: Array) -> Array:
-        """Return the actions (N,) of the present actor for states (N, size)."""
-        return self._agent.act_all(self._agent.see(states))
+        """Return the actions (N,) of the target actor, whose weights `weights` returns, for states
+        (N, size)."""
+        return self._agent.act_all(self._agent.see(states), target=True)
 
     def explore(self, states: Array, rng: np.random.Generator) -> Array:
         """Return the present actor's actions (N,) for states (N, size). Random noise is added with
@@ -40,7 +41,7 @@ class OffPolicy:
         agent, count = self._agent, len(states)
         noise = agent.algorithm.beta * EXPLORATION_NOISE * rng.standard_normal(count, np.float32)
         noise *= rng.random(count) < exploration_share(agent.replay.added)
-        return np.clip(self.act(states) + noise, -1.0, 1.0)
+        return np.clip(agent.act_all(agent.see(states)) + noise, -1.0, 1.0)
 
     def learn(
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float

@@ -137,12 +137,13 @@ class ViewRenderer:
                 self._road, options.camera, light=options.light, seed=options.light_seed
             )
             # Frees the graphics memory of an environment that is dropped without close().
-            weakref.finalize(self, self._camera.close).atexit = False
+            self._finaliser = weakref.finalize(self, self._camera.close)
+            self._finaliser.atexit = False
         return self._camera
 
     def close(self) -> None:
         """Free the graphics memory; the next `render` builds a new camera."""
         if self._camera is not None:
-            self._camera.close()
+            self._finaliser()  # closes the camera, and no longer refers to it
             self._camera = None
         self._images = {}

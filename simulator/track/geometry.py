@@ -124,6 +124,11 @@ class Track:
             ).hexdigest()
         )
 
+    @property
+    def driving_hash(self) -> str:
+        """`content_hash` and the surface, which together determine how a car drives."""
+        return f"{self.content_hash} {self.surface}"
+
     @cached_property
     def _table(self) -> FloatArray:
         table = np.empty((len(self.s0), piece_table.COLUMNS), dtype=np.float64)

@@ -126,7 +126,17 @@ def locate_everywhere(table: Table, x: float, y: float) -> tuple[int, float, flo
             best, best_s, best_d, best_squared = index, along, d, squared
     # In the wedge outside a kink of the centre line (the closing joint of a TORCS track) no
     # perpendicular foot exists; there the offset from the extended piece is an approximation.
-    return best, wrap(table, table[best, S0] + best_s), best_d
+    return at_foot(table, best, best_s, best_d)
+
+
+@inlined
+def at_foot(table: Table, index: int, along: float, to_middle: float) -> tuple[int, float, float]:
+    """Return the track coordinates (piece index, s, to_middle) of a point whose foot lies `along` m
+    from the start of piece `index`. The end of the last piece is the start of the first one."""
+    s = table[index, S0] + along
+    if s >= table[0, TRACK_LENGTH]:
+        return 0, 0.0, to_middle
+    return index, s, to_middle
 
 
 @inlined
@@ -154,7 +164,7 @@ def locate(table: Table, x: float, y: float, hint_index: int) -> tuple[int, floa
             along = min(max(along, 0.0), length)
             if abs(d) > HINT_REACH_M or d * table[index, CURVATURE] >= 1.0:
                 return locate_everywhere(table, x, y)
-            return index, wrap(table, table[index, S0] + along), d
+            return at_foot(table, index, along, d)
         last_move = move
         index = (index + move) % count
     return locate_everywhere(table, x, y)

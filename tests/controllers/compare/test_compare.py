@@ -1,6 +1,7 @@
 """The comparison: its drives, its file, resumption, tables and page."""
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -183,6 +184,29 @@ def test_a_drive_on_a_track_that_has_changed_is_driven_again(tmp_path: Path) -> 
         config = short(tmp_path, tracks=str(tracks / "mine.toml"), controllers="lqr")
         codes |= {*fingerprints(config, cells(config)).values()}
     assert len(codes) == 2
+
+
+def test_a_drive_on_another_surface_is_driven_again(tmp_path: Path) -> None:
+    codes = set()
+    for surface in ("concrete", "gravel"):
+        text = (OWN_TRACKS / "oval.toml").read_text()
+        changed = re.sub(r'^surface = ".*"$', f'surface = "{surface}"', text, flags=re.M)
+        (tmp_path / "mine.toml").write_text(changed)
+        config = short(tmp_path, tracks=str(tmp_path / "mine.toml"), controllers="lqr")
+        codes |= {*fingerprints(config, cells(config)).values()}
+    assert len(codes) == 2
+
+
+def test_a_drive_of_changed_control_laws_is_driven_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = short(tmp_path, tracks="oval", controllers="mpc-kalman")
+    before = fingerprints(config, cells(config))
+    shutil.copytree(comparison.LAWS, tmp_path / "laws")
+    with (tmp_path / "laws" / "delay.py").open("a") as file:
+        file.write("# another delay\n")
+    monkeypatch.setattr(comparison, "LAWS", tmp_path / "laws")
+    assert fingerprints(config, cells(config)) != before
 
 
 def test_a_refused_comparison_leaves_no_folder(tmp_path: Path) -> None:

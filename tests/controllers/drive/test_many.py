@@ -101,6 +101,11 @@ def test_an_error_of_update_batch_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_drive_with_sensor_noise_is_noisy() -> None:
+    outcomes = check_equal([task("lqr", Disturbance(noise=True)), task("lqr", Disturbance())])
+    assert [outcome.result.noisy for outcome in outcomes] == [True, False]
+
+
 def test_steering_beyond_the_lock_by_a_rounding_is_clipped(tmp_path: Path) -> None:
     (tmp_path / "laws.py").write_text(LAWS)
     held = f"{tmp_path / 'laws.py'}:Held"

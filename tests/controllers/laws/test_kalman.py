@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from controllers.interface import Observation, Observations
-from controllers.laws.delay import MAX_DELAY, first_delays, update_delay
+from controllers.laws.delay import FEWEST, LONGEST, MAX_DELAY, first_delays, update_delay
 from controllers.laws.kalman import CAR, KAPPA, StateEstimate, transitions
 from controllers.laws.lqr_gains import GRID_M_S, SLOWEST_M_S
 from trackfeatures import RoadClass
@@ -58,6 +58,16 @@ def test_without_motion_the_delay_stays_unknown() -> None:
         assert not update_delay(found, 0.005 * rng.normal(), 0.01 * rng.normal(), DT)
     assert found["steps"] == 0
     assert not found["is_known"]
+
+
+def test_the_newest_sample_is_compared_and_no_empty_one() -> None:
+    theta, rate = motion(MAX_DELAY + 2 * LONGEST + FEWEST)
+    found = first_delays(1, DT)[0]
+    for now in range(len(theta)):
+        update_delay(found, theta[now], rate[now], DT)
+    filled = np.any(found["squares"] > 0.0, axis=(0, 2))
+    assert filled[:FEWEST].all()
+    assert not filled[FEWEST:].any()
 
 
 def test_transitions_are_those_of_the_lateral_model() -> None:

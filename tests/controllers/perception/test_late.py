@@ -10,14 +10,14 @@ from controllers.drive.closed_loop import LOST_SPEED, run_lap, slow_down
 from controllers.drive.config import DriveConfig
 from controllers.drive.run import drive
 from controllers.laws.lqr import Lqr
-from controllers.perception.late import LatePerception
+from controllers.perception.late import LatePerception, RoadEstimate
 from controllers.perception.perceived import Perceived
 from controllers.perception.sources import truth
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from tests.controllers.fake_world import DT, Straight, at_rest
-from trackfeatures import UserError
+from trackfeatures import RoadClass, UserError
 
 
 def late(latency_s: float, drop: float = 0.0, **options: bool) -> LatePerception[Straight]:
@@ -51,6 +51,20 @@ def test_without_prediction_the_answer_is_late() -> None:
     for car.step in range(10):
         known = perceive(car)
     assert known.to_lane_centre == pytest.approx(car.offset - 2 * DT * 20.0 * math.sin(0.1))
+
+
+def test_an_answer_older_than_the_stored_motion_is_not_fused() -> None:
+    road = RoadEstimate(DT)
+    answers = {30: 0.0, 32: 1.0}  # each to an image of 30 steps before; 22 steps are stored
+    for step in range(33):
+        offset = answers.get(step)
+        arrived = None
+        if offset is not None:
+            arrived = Perceived(
+                offset, 0.0, RoadClass.STRAIGHT, None, offset_std_m=1.0, angle_std_rad=0.1
+            )
+        road.update(at_rest(vx=20.0), arrived, 30)
+    assert road.present(30).to_lane_centre == pytest.approx(1.0)
 
 
 def test_the_prediction_ends_a_second_after_the_last_answer() -> None:

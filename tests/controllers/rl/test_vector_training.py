@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controllers.laws.actor import load_actor
+from controllers.laws.actor import Actor, ActorCard, load_actor
+from controllers.laws.actor_state import PAPER
 from controllers.rl import vector_training
-from controllers.rl.config import TrainConfig, resolve
+from controllers.rl.cars import Step
+from controllers.rl.config import ALGORITHMS, TrainConfig, resolve
+from controllers.rl.off_policy import OffPolicy
 from controllers.rl.training import train
 from tests.typed import error_line, typed
 from trackfeatures.errors import UserError
@@ -152,6 +155,27 @@ def test_the_command_continues_with_the_stored_options(tmp_path: Path) -> None:
     done = typed("controllers", "train", "--out", out, "--resume", "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["steps"] == 3 * UPDATE
+
+
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
+def test_the_evaluated_actor_is_the_saved_one(algorithm: str) -> None:
+    settings = replace(ALGORITHMS[algorithm], learning_starts=64)
+    learner, rng = OffPolicy(settings, PAPER, 64, 0), np.random.default_rng(0)
+    states = rng.normal(0.0, 0.3, (64, PAPER.size)).astype(np.float32)
+    none = np.zeros(64, np.bool_)
+    for _ in range(5):
+        actions = learner.explore(states, rng)
+        rewards = -np.abs(actions.astype(np.float64) - 0.5)
+        nothing = np.zeros((64, 0), np.float32)
+        step = Step(states, states, nothing, nothing, rewards, none, none, states[:, 0])
+        learner.learn(states, actions, step, rng, 1.0)
+    card = ActorCard(
+        "paper", PAPER.parts, 5.5, tuple(learner.divisor.tolist()), learner.odd, settings.hidden,
+        algorithm, "oval", 0, 0, 0.0,
+    )  # fmt: skip
+    saved = Actor(card, learner.weights())
+    steered = [saved.steer(state) for state in states]
+    np.testing.assert_allclose(learner.act(states), steered, atol=1e-5)
 
 
 @pytest.mark.parametrize("words", [("--envs", "0"), ("--disturbed", "1.5"), ("--threads", "0")])

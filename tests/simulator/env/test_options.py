@@ -1,6 +1,8 @@
 """Options of the environments: observations, views, sensors, rewards, termination, videos."""
 
+import gc
 import math
+import weakref
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -14,7 +16,9 @@ from gymnasium.wrappers import AddRenderObservation, RecordVideo, RenderCollecti
 import simulator.env  # registers the names
 from simulator.camera import CLASSES, Camera, Light
 from simulator.env.reward import Ending
+from simulator.env.view_renderer import RenderOptions, ViewRenderer
 from simulator.sensors import STANDARD, Sensor
+from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.vehicle.state import CarState
 from trackfeatures.camera import CameraParameters
@@ -278,3 +282,14 @@ def test_the_place_of_a_picture_is_that_of_the_car_not_of_the_picture_before() -
         _, info = env.reset(seed=0, options={"s": 300.0})
     assert camera.render_views.call_args.kwargs == {"near_s": info["s"]}
     env.close()
+
+
+def test_a_closed_renderer_does_not_keep_its_camera() -> None:
+    """Each change of the road closes the camera; a training on random roads makes thousands."""
+    renderer = ViewRenderer(Road(find_track("oval")), RenderOptions(width=32, height=24))
+    cameras = []
+    for _ in range(2):
+        cameras.append(weakref.ref(renderer.camera))
+        renderer.close()
+    gc.collect()
+    assert [camera() for camera in cameras] == [None, None]

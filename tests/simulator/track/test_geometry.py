@@ -11,6 +11,8 @@ import trackfeatures as tf
 from simulator.track import piece_table
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track, wrap_angle
+from simulator.track.markings import MarkingStyle
+from simulator.track.pieces import Piece, assemble
 from simulator.track.road import Road
 from tests.simulator.track.track_samples import figure_of_eight, stadium
 
@@ -39,6 +41,25 @@ def test_stadium_matches_its_closed_form() -> None:
     # s wraps, both ways.
     assert float(STADIUM.at(LAP + 30.0).x) == pytest.approx(30.0)
     assert float(STADIUM.at(-10.0).heading) == pytest.approx(-0.2)
+
+
+@pytest.mark.parametrize("hint", [0, 4])
+def test_a_point_in_the_closing_gap_has_the_height_of_the_line(hint: int) -> None:
+    """The last piece falls 6 m to the line; the closing gap of an imported track is 0.15 m long."""
+    bend, straight = math.pi * 60.0, 100.0
+    pieces = [
+        *(Piece(straight, 0, 0, 0, 0, 0), Piece(bend, 1 / 60, 0, 0, 6, 6)),
+        *(Piece(2 * straight, 0, 6, 6, 6, 6), Piece(bend, 1 / 60, 6, 6, 6, 6)),
+        Piece(straight - 0.15, 0, 6, 6, 0, 0),
+    ]
+    track = Track.from_placed(
+        assemble(pieces), name="gap", source="torcs", width=11.0, surface="asphalt",
+        look="circuit", markings=MarkingStyle(),
+    )  # fmt: skip
+    table = track.arrays()
+    index, s, to_middle = piece_table.locate(table, -0.05, 0.5, hint)
+    assert piece_table.surface(table, index, s, to_middle)[0] == pytest.approx(0.0, abs=0.01)
+    assert (s, to_middle) == (pytest.approx(0.0, abs=0.1), pytest.approx(0.5))
 
 
 def test_wrap_angle_keeps_pi() -> None:
