@@ -133,7 +133,8 @@ class World:
         """Start an episode. `s` (m) defaults to 25 m before the start line; `angle` is track
         tangent minus yaw (rad, positive if the car points right); `speed` (m/s) is along the body.
 
-        The episode depends on the arguments alone. Raises UserError for a value out of range.
+        The episode depends only on the arguments, not on earlier episodes. Raises UserError for a
+        value out of range.
         """
         if self._closed:
             raise UserError("this world is closed; make a new one")
@@ -150,7 +151,6 @@ class World:
         self._controls[:] = 0.0, 0.0, 0.0, 1.0
         self._row[TRACK_AT + TRACK_S] = start % self.road.track.length_m
         measure_car(self._table, self._row)
-        self._row[[LAP, LAP_START]] = 0.0  # a car at s = 0 on a slope has not crossed the line
         self._state, self._started = None, True
         return self.state
 

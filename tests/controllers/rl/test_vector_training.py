@@ -167,7 +167,7 @@ def test_the_evaluated_actor_is_the_saved_one(algorithm: str) -> None:
         actions = learner.explore(states, rng)
         rewards = -np.abs(actions.astype(np.float64) - 0.5)
         nothing = np.zeros((64, 0), np.float32)
-        step = Step(states, states, nothing, nothing, rewards, none, none, states[:, 0])
+        step = Step(states, states, nothing, nothing, rewards, none, none, rewards)
         learner.learn(states, actions, step, rng, 1.0)
     card = ActorCard(
         "paper", PAPER.parts, 5.5, tuple(learner.divisor.tolist()), learner.odd, settings.hidden,

@@ -61,12 +61,6 @@ def test_the_same_seed_in_two_processes_is_bit_identical() -> None:
     assert there == [here, here]
 
 
-@pytest.mark.parametrize("track", ["town", "mountain-pass", "oval"])
-def test_a_car_that_starts_on_the_line_has_not_crossed_it(track: str) -> None:
-    with World(Road(find_track(track))) as world:
-        assert world.reset(seed=0, s=0.0).lap == 0
-
-
 def test_the_start_is_25_m_before_the_line_and_crossing_it_adds_a_lap() -> None:
     with World(stadium()) as world:
         length = world.road.track.length_m
