@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from runtime.signals import ended_by_signals
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 FAILED = 1  # exit code for a UserError or OSError; Typer exits with 2 for a wrong option
-INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C
+INTERRUPTED = 130  # the shell's code for a process ended by Ctrl-C; here also by SIGTERM or SIGHUP
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 Views = Annotated[
@@ -36,12 +37,17 @@ Views = Annotated[
 
 
 def main(app: Callable[[], object]) -> None:
-    """Run `app`. A UserError or OSError becomes one line `error: ...` on stderr and exit code 1."""
+    """Run `app`. A UserError or OSError becomes one line `error: ...` on stderr and exit code 1.
+
+    SIGTERM and SIGHUP interrupt `app` as Ctrl-C does: its files are closed, and the exit code is
+    130.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # tests and notebooks replace it
             stream.reconfigure(errors="backslashreplace")
     try:
-        app()
+        with ended_by_signals():
+            app()
     except UserError as error:
         fail(str(error))
     except BrokenPipeError:

@@ -1,10 +1,48 @@
-"""Lets a loop end after a signal, between two iterations."""
+"""Lets a command end in order after a signal, and a loop between two iterations."""
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+"""Signals of `kill`, of service managers and of a terminal that is closed."""
+REPEAT_S = 5.0
+"""Time (s) after a signal in which further signals are ignored: a shell whose terminal is closed
+sends a second SIGHUP, which must not interrupt the closing of files."""
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Within the block, let SIGTERM and SIGHUP raise KeyboardInterrupt, as Ctrl-C does, so that
+    files are closed.
+
+    A signal that is ignored at the start of the block stays ignored, for example SIGHUP under
+    `nohup`. Only the main thread can receive signals; in another thread the block has no effect.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ignored_until = 0.0
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        nonlocal ignored_until
+        now = time.monotonic()
+        if now >= ignored_until:
+            ignored_until = now + REPEAT_S
+            raise KeyboardInterrupt
+
+    before = {number: signal.getsignal(number) for number in ENDING}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -6,10 +6,9 @@ datagen collect --rounds 60 --out datasets/default
 """
 
 import json
-import signal
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -94,7 +93,7 @@ def collect(
     make_pool(executor, workers, lambda message: None)  # checks the options before any change
     require_matching_folder(folder, plan)
     folder.mkdir(parents=True, exist_ok=True)
-    with _sigterm_as_interrupt(), folder_lock(folder, shard):
+    with folder_lock(folder, shard):
         with setup_lock(folder):
             initialise_folder(folder, plan)
         _remove_leftovers(folder, rounds)
@@ -147,16 +146,6 @@ def _remove_leftovers(folder: Path, rounds: Sequence[RoundPlan]) -> None:
     for entry in rounds:
         if entry.id not in states:
             round_path(folder, entry.id).unlink(missing_ok=True)
-
-
-@contextmanager
-def _sigterm_as_interrupt() -> Iterator[None]:
-    """Make SIGTERM raise KeyboardInterrupt within the block, as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def require_matching_folder(folder: Path, plan: Plan) -> None:

@@ -39,6 +39,9 @@ CODEC = "jpeg"
 SINCE_1970_S = 1e8
 """A time above this limit, s, is a time since 1970 (recordings, streams); a smaller time is a time
 since the start of a film or round."""
+CHUNK_BYTES = 1 << 16
+"""Size of a chunk, about three images: the loss if the process is killed. Files are 2 % larger than
+with chunks of 1 MiB, and take the same time."""
 ORANGE = Color(**dict(zip("rgb", (c / 255 for c in PREDICTION_COLOUR), strict=True)), a=1.0)
 
 
@@ -53,7 +56,7 @@ class McapWriter:
         self._count = 0
         self._view: CameraParameters | None = None
         self._file = path.open("wb")
-        self._mcap = Mcap(self._file, compression=CompressionType.ZSTD)
+        self._mcap = Mcap(self._file, CHUNK_BYTES, CompressionType.ZSTD)
         self._mcap.start(profile="", library="driverview predict")
         self._channels = {name: self._protobuf(name) for name in TOPICS}
         self._channels[FEATURES] = self._mcap.register_channel(
@@ -99,6 +102,7 @@ class McapWriter:
             self._mcap.add_message(
                 self._channels[topic], time, data, publish_time=time, sequence=self._count
             )
+            self._file.flush()
         except OSError as error:
             error.filename = str(self._path)  # missing after a failed write
             raise

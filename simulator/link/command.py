@@ -5,7 +5,6 @@ simulator link --header driverview_link.h
 """
 
 import json
-import signal
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -60,7 +59,6 @@ def _write_header(path: Path) -> None:
 def _serve(config: LinkConfig, as_json: bool) -> None:
     from simulator.link.process import run
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     summary = run(config, lambda text: typer.echo(text, err=True))
     if as_json:
         typer.echo(json.dumps(asdict(summary)))

@@ -1,6 +1,7 @@
 """Exit codes, error lines and options of commands."""
 
 import errno
+import signal
 
 import pytest
 
@@ -39,3 +40,9 @@ def test_an_error_is_one_line_and_exit_code_1(
 
 def test_ctrl_c_exits_130_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_and_exit(KeyboardInterrupt(), capsys) == (130, "interrupted\n")
+
+
+def test_sigterm_ends_a_command_as_ctrl_c_does(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(lambda: signal.raise_signal(signal.SIGTERM))
+    assert (exit_.value.code, capsys.readouterr().err) == (130, "interrupted\n")

@@ -1,14 +1,15 @@
-"""A loop ends after a signal, between two steps."""
+"""A command closes its files after a signal; a loop ends between two steps."""
 
 import signal
 import threading
 import time
+from contextlib import ExitStack
 from enum import IntEnum
 
 import numpy as np
 import pytest
 
-from runtime.signals import interrupts
+from runtime.signals import ENDING, ended_by_signals, interrupts
 
 
 class Kind(IntEnum):
@@ -47,3 +48,39 @@ def test_another_thread_is_not_interrupted() -> None:
     thread.start()
     thread.join()
     assert answers == [False]
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_command_is_interrupted_once_and_its_files_are_closed(number: signal.Signals) -> None:
+    before = {each: signal.signal(each, signal.SIG_DFL) for each in ENDING}
+    closed: list[str] = []
+
+    def command() -> None:
+        with ended_by_signals(), ExitStack() as files:
+            files.callback(closed.append, "film")
+            files.callback(signal.raise_signal, signal.SIGHUP)  # a closing terminal sends two
+            signal.raise_signal(number)
+
+    with pytest.raises(KeyboardInterrupt):
+        command()
+    assert closed == ["film"]
+    for each, handler in before.items():
+        assert signal.signal(each, handler) == signal.SIG_DFL
+
+
+def test_a_signal_whose_interrupt_was_lost_is_raised_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.signals.REPEAT_S", 0.0)
+    with ended_by_signals():
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_that_nohup_ignores_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_by_signals():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
