@@ -145,7 +145,8 @@ class TrainConfig:
         Option(
             "--change-data",
             help="With --resume: allow another dataset as --data than at the start of the "
-            "training.",
+            "training, and other values of --hold-out-drives and --skip-undecodable. For another "
+            "folder as --data, these two options have their defaults unless they are given.",
         ),
     ] = False
 

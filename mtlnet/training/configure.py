@@ -30,6 +30,9 @@ DATASET = Path("datasets/default")
 RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
 """Fields of TrainConfig that may change when a run is resumed; a change of any other field is
 refused."""
+ABOUT_DATA = ("hold_out_drives", "skip_undecodable")
+"""Fields of TrainConfig about the dataset. With `change_data` they may change, and another dataset
+starts with their defaults."""
 
 
 def new_config(options: Mapping[str, Any], out: Path | None) -> TrainConfig:
@@ -119,21 +122,28 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
     """Read the stored configuration of a run and change it by the fields `given` on the command
     line; returns the configuration and the description of the data.
 
-    `iterations`, `minutes`, `device`, `threads`, `data` and `change_data` may change. Raises
-    UserError when `given` changes another field.
+    `iterations`, `minutes`, `device`, `threads`, `data` and `change_data` may change. With
+    `change_data`, `hold_out_drives` and `skip_undecodable` may change too; for another folder as
+    `data` they have their defaults unless given. Raises UserError when `given` changes another
+    field.
     """
     stored, data = read_config(run)
     given = dict(given)
     if heads := given.pop("heads", None):
         given["network"] = with_heads(given.get("network", stored.network), heads)
+    free = RESUMABLE_WITH
+    if given.get("change_data"):
+        free += ABOUT_DATA
+        if given.get("data", stored.data).resolve() != stored.data.resolve():
+            given = {**{name: getattr(TrainConfig, name) for name in ABOUT_DATA}, **given}
     for name, value in given.items():
         kept = getattr(stored, name)
-        if name not in RESUMABLE_WITH and value != kept:
+        if name not in free and value != kept:
             raise UserError(
                 f"{run} was started with {name} {kept}, now {value} is given; leave it out to "
                 "resume, or start a new run with another --out"
             )
-    return replace(stored, **{k: v for k, v in given.items() if k in RESUMABLE_WITH}), data
+    return replace(stored, **{k: v for k, v in given.items() if k in free}), data
 
 
 def newest_run() -> Path:

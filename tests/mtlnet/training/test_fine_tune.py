@@ -19,7 +19,7 @@ from mtlnet.model.network import Network, initialise, load_network, predict_imag
 from mtlnet.model.pretrained import load_pretrained
 from mtlnet.train import start_training
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.configure import open_pretrained
+from mtlnet.training.configure import open_pretrained, resume_config
 from mtlnet.training.device import subnormals_as_zero
 from mtlnet.training.sources import continue_from_model, custom_training_data, open_training_data
 from trackfeatures.errors import UserError
@@ -135,12 +135,18 @@ def test_images_of_another_camera_are_evaluated_and_trained_on(
     assert frames.labels.distances[0, 0] == pytest.approx(-1.0 * 1.2 / 1.5, abs=1e-3)
 
 
+def write_drives(folder: Path, drives: list[str]) -> None:
+    """Write a `labels.csv` with six pictures, which belong to the drives in turn."""
+    lines = ["file,ml,mr,l,m,r,angle,heading,drive"]
+    for i in range(6):
+        lines.append(f'{i}.png,-1.{i},2.{9 - i},?,?,?,0.01,?,"{drives[i % len(drives)]}"')
+    (folder / "labels.csv").write_text("\n".join(lines) + "\n")
+
+
 def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
     published: Path, custom_images: Path, tmp_path: Path
 ) -> None:
-    lines = ["file,ml,mr,l,m,r,angle,heading,drive"]
-    lines += [f"{i}.png,-1.{i},2.{9 - i},?,?,?,0.01,?,drive {i % 3}" for i in range(6)]
-    (custom_images / "labels.csv").write_text("\n".join(lines) + "\n")
+    write_drives(custom_images, ["drive 0", "drive 1", "drive 2"])
     options = {"data": custom_images, "init": str(published), "iterations": 12, "batch": 4}
     options.update(device="cpu", threads=1, hold_out_drives="drive 1, drive 0")
     start_training(options, tmp_path / "run", resume=False)
@@ -160,6 +166,28 @@ def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
         custom_training_data(custom_images, read_card(published), "drive 0,x")
     with pytest.raises(UserError, match="names all drives"):
         custom_training_data(custom_images, read_card(published), "drive 0,drive 1,drive 2")
+
+
+@pytest.mark.usefixtures("short_fit")
+def test_a_run_with_drives_held_out_continues_on_other_data(
+    published: Path, custom_images: Path, dataset: Path, tmp_path: Path
+) -> None:
+    write_drives(custom_images, ["a", "b"])
+    run = tmp_path / "run"
+    options = {"data": custom_images, "init": str(published), "iterations": 1, "batch": 4}
+    options.update(device="cpu", threads=1, hold_out_drives="b")
+    start_training(options, run, resume=False)
+    same = {"data": custom_images, "change_data": True}
+    assert resume_config(run, same)[0].hold_out_drives == "b"  # more pictures in the same folder
+    assert resume_config(run, {**same, "hold_out_drives": "a"})[0].hold_out_drives == "a"
+    with pytest.raises(UserError, match="started with hold_out_drives b, now a is given"):
+        resume_config(run, {"hold_out_drives": "a"})
+    rounds = {"data": dataset, "change_data": True, "iterations": 2, "skip_undecodable": True}
+    start_training(rounds, run, resume=True)
+    card = read_card(run)
+    assert [data["path"] for data in card.data["earlier"]][-1] == str(custom_images)
+    resumed, _ = resume_config(run, {})
+    assert (resumed.data, resumed.hold_out_drives, resumed.skip_undecodable) == (dataset, "", True)
 
 
 def test_wrong_options_are_refused(
