@@ -135,8 +135,8 @@ class TrainConfig:
         str,
         Option(
             help="Names of drives (column drive of labels.csv) whose images are left out of "
-            "the training, separated by commas. `mtlnet evaluate` reports the errors on "
-            "them separately.",
+            "the training, separated by commas. A name that contains commas is given as it "
+            "is. `mtlnet evaluate` reports the errors on them separately.",
             show_default="none",
         ),
     ] = ""

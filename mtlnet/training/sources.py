@@ -119,8 +119,8 @@ def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, li
     The drives left out are not used at all: neither for the weights nor for the standard
     deviations. Raises UserError for a drive without pictures, and when no drive is left.
     """
-    names = [name.strip() for name in drives.split(",") if name.strip()]
     known = sorted({picture.drive for picture in images.pictures})
+    names = _drive_names(drives, known)
     for name in names:
         if name not in known:
             raise UserError(
@@ -131,6 +131,18 @@ def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, li
     if not kept:
         raise UserError("--hold-out-drives names all drives; leave one to train on")
     return images.take(kept), names
+
+
+def _drive_names(text: str, known: list[str]) -> list[str]:
+    """Split `text` at its commas into names. A name in `known` is not split at its own commas; of
+    several possible names the longest is taken."""
+    names, parts = [], text.split(",")
+    while parts:
+        starts = [",".join(parts[:count]).strip() for count in range(len(parts), 0, -1)]
+        name = next((start for start in starts if start in known), starts[-1])
+        names.append(name)
+        parts = parts[len(parts) - starts.index(name) :]
+    return [name for name in names if name]
 
 
 def recorded_training_data(dataset: Dataset, *, skip_undecodable: bool = False) -> TrainingData:

@@ -168,6 +168,24 @@ def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
         custom_training_data(custom_images, read_card(published), "drive 0,drive 1,drive 2")
 
 
+@pytest.mark.parametrize(
+    ("given", "held_out"),
+    [
+        ("Berlin, night", ["Berlin, night"]),
+        ("Berlin", ["Berlin"]),
+        ("Rome ,Berlin, night,Berlin,", ["Rome", "Berlin, night", "Berlin"]),
+    ],
+)
+def test_a_drive_is_held_out_by_a_name_with_commas(
+    published: Path, custom_images: Path, given: str, held_out: list[str]
+) -> None:
+    write_drives(custom_images, ["Berlin, night", "Berlin", "Rome", "Oslo"])
+    data = custom_training_data(custom_images, read_card(published), given)
+    assert data.about["held_out_drives"] == held_out
+    kept = {picture.drive for picture in data.frames.pictures}  # type: ignore[union-attr]
+    assert kept == {"Berlin, night", "Berlin", "Rome", "Oslo"} - set(held_out)
+
+
 @pytest.mark.usefixtures("short_fit")
 def test_a_run_with_drives_held_out_continues_on_other_data(
     published: Path, custom_images: Path, dataset: Path, tmp_path: Path
