@@ -8,6 +8,7 @@ Names that are not UTF-8 are written in tables as described in `runtime.files`.
 import csv
 import json
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -66,6 +67,14 @@ def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
 
         return McapWriter(path, camera, fps)
     return FilmWriter(path, camera, fps) if kind == FILM_SUFFIX else PictureWriter(path, camera)
+
+
+def require_different(outputs: Sequence[Path]) -> None:
+    """Raise UserError if two of `outputs` are the same file or folder, also by other names."""
+    places = [path.resolve() for path in outputs]
+    for number, path in enumerate(outputs):
+        if places[number] in places[:number]:
+            raise UserError(f"--out {path} is given twice; give each file once")
 
 
 def table_row(item: SourceImage, prediction: Prediction) -> dict[str, Any]:

@@ -157,6 +157,19 @@ def test_wrong_inputs_and_outputs_are_refused(
         predict_files(engine, inputs, [Path(name) for name in outputs])
 
 
+@pytest.mark.parametrize("again", ["d.csv", "./d.csv", "link/d.csv"])
+def test_a_file_is_not_written_twice(
+    engine: BrightnessEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, again: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to(tmp_path)
+    Path("d.csv").write_text("kept")
+    image = write_jpeg(Path("a.jpg"), 10)
+    with pytest.raises(UserError, match=r"--out .*d\.csv is given twice"):
+        predict_files(engine, [str(image)], [Path("d.csv"), Path("d.jsonl"), Path(again)])
+    assert Path("d.csv").read_text() == "kept"
+
+
 def test_a_file_to_read_is_not_overwritten(tmp_path: Path, engine: BrightnessEngine) -> None:
     film = write_film(tmp_path / "film.mp4", [10, 200])
     before = film.read_bytes()
