@@ -2,8 +2,9 @@
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from numbers import Real
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypedDict, Unpack, overload
@@ -20,7 +21,7 @@ from mtlnet.inference.rectification import Rectification, read_camera
 from mtlnet.predict.lenses import with_lens
 from mtlnet.predict.run import answer, first_of
 from mtlnet.predict.writers import draw_prediction
-from mtlnet.sources.find import Source, find_sources
+from mtlnet.sources.find import NO_TOPIC, Source, find_sources
 from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens, Picture, fit
 from mtlnet.sources.read import SourceImage, read_sources
@@ -28,8 +29,13 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 Image = NDArray[np.uint8]
-OneImage = str | Path | bytes | Image
+Bytes = bytes | bytearray | memoryview
+OneImage = str | Path | Bytes | Image
 """An image: a file, the bytes of a file (JPEG, PNG, ...), or pixels (H, W, 3) uint8 RGB."""
+ACCEPTED = (
+    "a file, folder or pattern, a webcam (as text, such as '0') or stream, the bytes of an image "
+    "file, pixels as a numpy array (height, width, 3) of uint8 RGB, or a list of images"
+)
 
 log = logging.getLogger("mtlnet")
 
@@ -118,7 +124,7 @@ class Model:
         return self.card.camera
 
     @overload
-    def predict(self, source: bytes | Image, **options: Unpack[Options]) -> Features: ...
+    def predict(self, source: Bytes | Image, **options: Unpack[Options]) -> Features: ...
 
     @overload
     def predict(self, source: Sequence[OneImage], **options: Unpack[Options]) -> list[Features]: ...
@@ -143,12 +149,13 @@ class Model:
         CameraParameters of the images; "model": the model's camera took them; None: as with
         "model", except that the camera of a film or stream is estimated from its pictures. With
         "model" and None, the camera that a recording states has precedence. `fov_y_deg`: vertical
-        field of view of the images in degrees, if no `camera` is given. `topic`: topic with the
-        pictures of a recording.
+        field of view of the images in degrees, if no `camera` is given; not for a recorded round.
+        `topic`: topic with the pictures of a recording.
 
-        Raises UserError for a source that cannot be used (ImageError for one image). An iterator
-        raises UserError after the last image, if any image could not be used. Messages about files
-        that are skipped and about cameras that are found go to the logger `mtlnet`.
+        Raises UserError for a source of another type or that cannot be used (ImageError for one
+        image), and for options that do not apply to it. An iterator raises UserError after the last
+        image, if any image could not be used. Messages about files that are skipped and about
+        cameras that are found go to the logger `mtlnet`.
         """
         lens = self._lens(camera, fov_y_deg)
         if isinstance(source, str | Path):
@@ -157,19 +164,27 @@ class Model:
                 return self._all(sources, lens, calibrate=camera is None)
             if sources[0].problem:
                 raise UserError(sources[0].problem)
-        if isinstance(source, str | Path | bytes | np.ndarray):
+        elif topic:
+            raise UserError(f"topic {topic!r}: {NO_TOPIC}")
+        if isinstance(source, str | Path | Bytes | np.ndarray):
             return self._one(source, lens)
+        if not isinstance(source, Iterable):
+            raise _not_accepted(source)
         return [self._one(image, lens) for image in source]
 
     __call__ = predict
 
     def _lens(self, camera: str | Path | CameraParameters | None, fov_y_deg: float | None) -> Lens:
-        if camera is None or camera == "model":
-            if fov_y_deg is not None and not 0 < fov_y_deg < 180:
-                raise UserError(f"fov_y_deg is {fov_y_deg:g}; give a value above 0 and below 180")
-            return fov_y_deg
+        if camera is None or (isinstance(camera, str) and camera == "model"):
+            if fov_y_deg is None:
+                return None
+            if not isinstance(fov_y_deg, Real) or not 0 < fov_y_deg < 180:
+                raise UserError(f"fov_y_deg is {fov_y_deg!r}; give degrees above 0 and below 180")
+            return float(fov_y_deg)  # from a number of numpy
         if fov_y_deg is not None:
             raise UserError("the camera holds the field of view; leave fov_y_deg out")
+        if not isinstance(camera, CameraParameters | str | Path):
+            raise UserError(f"the camera is {camera!r}; give a camera file or CameraParameters")
         if not isinstance(camera, CameraParameters):
             camera = read_camera(Path(camera), self.camera, log.info)
         return Rectification(camera, self.camera)
@@ -273,16 +288,22 @@ def load(
 
 def _pixels(image: OneImage) -> Image:
     """Return the pixels (H, W, 3) uint8 RGB of one image. Raises ImageError or UserError."""
-    if isinstance(image, bytes):
-        return decode_file(image)
+    if isinstance(image, Bytes):
+        return decode_file(bytes(image))
     if isinstance(image, str | Path):
         return read_whole_image(Path(image))
+    if not isinstance(image, np.ndarray):
+        raise _not_accepted(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
         raise UserError(
             f"the pixels are {image.dtype} of shape {image.shape}; give uint8 RGB of shape "
             "(height, width, 3)"
         )
     return image
+
+
+def _not_accepted(source: object) -> UserError:
+    return UserError(f"an input is of type {type(source).__name__}; give {ACCEPTED}")
 
 
 def _camera(item: SourceImage, lens: Lens, model: CameraParameters) -> CameraParameters:

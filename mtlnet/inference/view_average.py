@@ -40,7 +40,7 @@ _MARKINGS_FROM = _FROM[: len(tf.MARKINGS)]
 def check_count(count: int) -> None:
     """Raise UserError unless `count` is a number of views that can be averaged: 1, 2 or 6."""
     if count not in COUNTS:
-        raise UserError(f"--views {count}: give {COUNTS[0]}, {COUNTS[1]} or {COUNTS[2]}")
+        raise UserError(f"--views {count!r}: give {COUNTS[0]}, {COUNTS[1]} or {COUNTS[2]}")
 
 
 class Views:

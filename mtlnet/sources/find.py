@@ -22,6 +22,8 @@ UNREMARKABLE = ("thumbs.db", "desktop.ini", "labels.csv", "camera.yaml")
 MAX_NAMED = 5
 """Maximum number of files named in a note."""
 
+NO_TOPIC = "no input is a Foxglove file or ROS 2 bag; leave the topic out"
+
 Note = Callable[[str], None]
 
 
@@ -61,9 +63,12 @@ def find_sources(
     The files of an input are in natural order (`frame2` before `frame10`). An input that names
     nothing becomes a source with a problem. `note` is called with a line about other files and
     subfolders of a folder, which are left out. `topic`: topic to read from recordings; empty: the
-    only topic with pictures.
+    only topic with pictures. Raises UserError for a topic if no input is a recording.
     """
-    return [source for given in inputs for source in _find(given, note, topic)]
+    sources = [source for given in inputs for source in _find(given, note, topic)]
+    if topic and not any(s.problem or s.kind is SourceKind.RECORDING for s in sources):
+        raise UserError(f"topic {topic!r}: {NO_TOPIC}")
+    return sources
 
 
 def _find(given: str, note: Note, topic: str) -> list[Source]:

@@ -135,8 +135,10 @@ def _read_round(source: Source, camera: CameraParameters) -> Iterator[SourceImag
     from mtlnet.data.model_labels import moved_rounds, round_rectification
 
     path = source.path
-    if isinstance(source.lens, Rectification):
-        raise UserError(f"{path}: --camera is for images and films; a round has its own camera")
+    if source.lens is not None:
+        raise UserError(
+            f"{path}: --camera and --fov-y-deg are for images and films; a round has its own camera"
+        )
     index = open_round(path)
     tf.require_version(index.header.definitions, str(path))
     recorded = index.header.dataset_camera

@@ -131,7 +131,7 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
     given = dict(given)
     if heads := given.pop("heads", None):
         given["network"] = with_heads(given.get("network", stored.network), heads)
-    free = RESUMABLE_WITH
+    free: tuple[str, ...] = RESUMABLE_WITH
     if given.get("change_data"):
         free += ABOUT_DATA
         if given.get("data", stored.data).resolve() != stored.data.resolve():

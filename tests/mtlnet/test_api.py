@@ -131,6 +131,45 @@ def test_a_field_of_view_is_that_of_the_drawing_too(model: Model) -> None:
     assert (drawn[0] & drawn[1]).sum() > 0.9 * drawn[1].sum()  # lines are twice as thick
 
 
+def test_a_source_of_another_type_is_refused(model: Model, road: np.ndarray) -> None:
+    png = cv2.imencode(".png", road[..., ::-1])[1].tobytes()
+    one, *others = (model.predict(kind(png)) for kind in (bytes, bytearray, memoryview))
+    assert [found.as_json() for found in others] == [one.as_json()] * 2
+    wrong = [None, 0, [1], [None], {"a": 1}.values(), [[road]], np.uint8(3)]
+    for source in wrong:
+        with pytest.raises(UserError, match=r"of type \w+; give a file, .* or a list of images"):
+            model.predict(source)  # type: ignore[arg-type]
+    for camera in (5, road):
+        with pytest.raises(UserError, match="give a camera file or CameraParameters"):
+            model.predict(road, camera=camera)  # type: ignore[call-overload]
+    for views in ("2", 3):
+        with pytest.raises(UserError, match=f"--views {views!r}: give 1, 2 or 6"):
+            load("default", views=views)  # type: ignore[arg-type]
+
+
+def test_an_option_that_does_not_apply_is_refused(
+    model: Model, road: np.ndarray, dataset: Path, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), road)
+    for source in (road, [road], tmp_path / "a.png", tmp_path):
+        with pytest.raises(UserError, match="topic '/x': no input is a Foxglove file or ROS 2 bag"):
+            model.predict(source, topic="/x")
+    with pytest.raises(UserError, match=r"there is no image file .*none\.mcap"):
+        model.predict(tmp_path / "none.mcap", topic="/x")
+    answers = model.predict(dataset / "rounds" / "r000.mcap", fov_y_deg=20.0)
+    with pytest.raises(UserError, match="--fov-y-deg are for images and films; a round has its"):
+        next(answers)
+
+
+def test_a_field_of_view_can_be_a_number_of_numpy(model: Model) -> None:
+    wide = np.full((840, 1120, 3), 90, np.uint8)
+    found = model.predict(wide, fov_y_deg=np.float32(90))  # type: ignore[call-overload]
+    assert found.camera.fov_y_deg == 90.0
+    assert found.as_json() == model.predict(wide, fov_y_deg=90).as_json()
+    with pytest.raises(UserError, match="fov_y_deg is '90'; give degrees"):
+        model.predict(wide, fov_y_deg="90")  # type: ignore[call-overload]
+
+
 def test_faulty_sources_are_one_clear_error(model: Model, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="float64 of shape"):
         model.predict(np.zeros((210, 280, 3)))  # type: ignore[arg-type]
