@@ -11,6 +11,7 @@ const COLOURS = { left: "#ffd23e", right: "#5ad1ff" };
 let token = decodeURIComponent(location.hash.slice(1)) || sessionStorage.getItem("token") || "";
 let pictures = [], number = 0, shown = null, image = null, view = { scale: 1 };
 let drag = null, steps = [], saves = [], busy = false, again = false;
+let working = false; // while a save, an undo or a removal runs, keys and buttons are ignored
 const ahead = new Map(); // pictures that were fetched in advance
 
 async function call(path, method = "GET", body) {
@@ -51,6 +52,8 @@ function fetched(n) {
 
 async function open(n) {
   number = n;
+  shown = image = drag = null; // nothing of the picture before can be saved for this picture
+  steps = [];
   document.body.dataset.ready = "";
   say("");
   try {
@@ -58,11 +61,13 @@ async function open(n) {
     if (n !== number) return;
     shown = structuredClone(data);
     image = bitmap;
-    steps = [];
     $("heading").value = shown.source === "label" ? shown.row.heading : "";
     if (shown.row) { $("drive").value = shown.row.drive || ""; $("light").value = shown.row.light || ""; }
     say(shown.note);
-  } catch (error) { shown = image = null; say(error.message); }
+  } catch (error) {
+    if (n !== number) return;
+    say(error.message);
+  }
   resize();
   if (n + 1 < pictures.length) fetched(n + 1).catch(() => {});
   for (const old of ahead.keys()) if (Math.abs(old - n) > 2) ahead.delete(old);
@@ -145,7 +150,7 @@ function nearest(point) {
 }
 
 canvas.addEventListener("pointerdown", (event) => {
-  if (!shown) return;
+  if (!shown || working) return;
   const point = pixel(event);
   drag = nearest(point);
   if (!drag) return;
@@ -186,26 +191,27 @@ async function fit() {
 let waiting = Promise.resolve();
 
 async function fitOnce() {
-  const held = drag, of = number;
-  const body = { curvature: shown.markings.curvature, pitch_deg: $("fixed").checked ? shown.camera_pitch_deg : null };
+  if (!shown) return;
+  const held = drag, of = shown;
+  const body = { curvature: of.markings.curvature, pitch_deg: $("fixed").checked ? of.camera_pitch_deg : null };
   for (const side of SIDES) {
-    const [near, bend, far] = shown.handles[side];
+    const [near, bend, far] = of.handles[side];
     body[side] = held && held.which === BEND && held.side === side ? [near, bend, far] : [near, far];
   }
   if (held && held.which === BEND) body.curvature = null;
   try {
-    const found = await (await call(`api/pictures/${of}/fit`, "POST", body)).json();
-    if (of !== number) return;
-    shown.markings = found.markings;
-    shown.lines = found.lines;
-    for (const side of SIDES) shown.handles[side] = shown.handles[side].map((at, which) => {
+    const found = await (await call(`api/pictures/${number}/fit`, "POST", body)).json();
+    if (of !== shown) return;
+    of.markings = found.markings;
+    of.lines = found.lines;
+    for (const side of SIDES) of.handles[side] = of.handles[side].map((at, which) => {
       if (drag && drag.side === side && drag.which === which) return at;
       const u = across(found.lines[side], at[1]);
-      return u === null || u < 0 || u > shown.width - 1 ? found.handles[side][which] : [u, at[1]];
+      return u === null || u < 0 || u > of.width - 1 ? found.handles[side][which] : [u, at[1]];
     });
     say("");
-  } catch (error) { say(error.message); }
-  draw();
+  } catch (error) { if (of === shown) say(error.message); }
+  if (of === shown) draw();
 }
 
 function across(line, row) {
@@ -218,48 +224,52 @@ function across(line, row) {
 
 const label = (markings, heading, drive, light) => ({ ...markings, heading, drive, light });
 
+// Runs a save, an undo or a removal.
+async function alone(work) {
+  working = true;
+  try { await work(); } catch (error) { say(error.message); } finally { working = false; }
+}
+
 async function save() {
   if (!shown) return;
+  const of = number, picture = shown, texts = ["heading", "drive", "light"].map((id) => $(id).value);
   await waiting;
-  const old = shown.source === "label" ? [await (await call(`api/pictures/${number}`)).json()] : [];
-  try {
-    const row = await (await call(`api/pictures/${number}/label`, "PUT",
-      label(shown.markings, $("heading").value, $("drive").value, $("light").value))).json();
-    saves.push({ number, before: old.length ? old[0] : null });
-    pictures[number].labelled = true;
-    ahead.delete(number);
-    document.body.dataset.saved = row.file;
-    if (number + 1 < pictures.length) await open(number + 1);
-    else { await open(number); say("this was the last picture"); }
-  } catch (error) { say(error.message); }
+  const before = picture.source === "label" ? await (await call(`api/pictures/${of}`)).json() : null;
+  const row = await (await call(`api/pictures/${of}/label`, "PUT", label(picture.markings, ...texts))).json();
+  changed(of, true, before);
+  document.body.dataset.saved = row.file;
+  await open(Math.min(of + 1, pictures.length - 1));
+  if (of === number) say("this was the last picture");
+}
+
+function changed(of, labelled, before) {
+  saves.push({ of, before });
+  pictures[of].labelled = labelled;
+  ahead.delete(of);
 }
 
 async function undo() {
   await waiting;
   if (steps.length) { Object.assign(shown, steps.pop()); draw(); return; }
-  const last = saves.pop();
-  if (!last) { say("nothing to take back"); return; }
-  try {
-    const { before } = last;
-    if (before) await call(`api/pictures/${last.number}/label`, "PUT",
-      label(before.markings, before.row.heading, before.row.drive || "", before.row.light || ""));
-    else await call(`api/pictures/${last.number}/label`, "DELETE");
-    pictures[last.number].labelled = Boolean(before);
-    ahead.delete(last.number);
-    await open(last.number);
-  } catch (error) { say(error.message); }
+  if (!saves.length) { say("nothing to take back"); return; }
+  const { of, before } = saves.at(-1);
+  if (before) await call(`api/pictures/${of}/label`, "PUT",
+    label(before.markings, before.row.heading, before.row.drive || "", before.row.light || ""));
+  else await call(`api/pictures/${of}/label`, "DELETE");
+  saves.pop();
+  pictures[of].labelled = Boolean(before);
+  ahead.delete(of);
+  await open(of);
 }
 
 async function remove() {
-  if (!pictures[number].labelled) { await go(1); return; }
-  try {
-    const before = await (await call(`api/pictures/${number}`)).json();
-    await call(`api/pictures/${number}/label`, "DELETE");
-    saves.push({ number, before: before.source === "label" ? before : null });
-    pictures[number].labelled = false;
-    ahead.delete(number);
-    await open(number);
-  } catch (error) { say(error.message); }
+  const of = number;
+  if (!pictures[of].labelled) { await go(1); return; }
+  if (!shown) return;
+  const before = await (await call(`api/pictures/${of}`)).json();
+  await call(`api/pictures/${of}/label`, "DELETE");
+  changed(of, false, before.source === "label" ? before : null);
+  await open(of);
 }
 
 async function go(by) {
@@ -267,21 +277,25 @@ async function go(by) {
   if (n >= 0 && n < pictures.length) await open(n); else say(by < 0 ? "this is the first picture" : "this is the last picture");
 }
 
+function act(work) { if (!working) work(); }
+
 const KEYS = {
-  Enter: save, n: save, N: save, u: undo, U: undo, ArrowLeft: () => go(-1), ArrowRight: () => go(1), x: remove, X: remove,
+  ArrowLeft: () => go(-1), ArrowRight: () => go(1),
   0: () => { $("heading").value = "?"; }, 1: () => { $("heading").value = "left"; },
   2: () => { $("heading").value = "straight"; }, 3: () => { $("heading").value = "right"; },
 };
+for (const [keys, work] of [[["Enter", "n", "N"], save], [["u", "U"], undo], [["x", "X"], remove]])
+  for (const key of keys) KEYS[key] = () => alone(work);
 window.addEventListener("keydown", (event) => {
   if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName) && event.target.type !== "checkbox") return;
-  if ((event.ctrlKey || event.metaKey) && event.key === "z") { event.preventDefault(); undo(); return; }
+  if ((event.ctrlKey || event.metaKey) && event.key === "z") { event.preventDefault(); act(KEYS.u); return; }
   if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in KEYS)) return;
   if (event.key === "Enter" && event.target.tagName === "BUTTON") return;
   event.preventDefault();
-  KEYS[event.key]();
+  act(KEYS[event.key]);
 });
-for (const [id, work] of [["next", save], ["undo", undo], ["remove", remove], ["previous", () => go(-1)], ["skip", () => go(1)]])
-  $(id).addEventListener("click", (event) => { event.currentTarget.blur(); work(); });
+for (const [id, key] of [["next", "n"], ["undo", "u"], ["remove", "x"], ["previous", "ArrowLeft"], ["skip", "ArrowRight"]])
+  $(id).addEventListener("click", (event) => { event.currentTarget.blur(); act(KEYS[key]); });
 $("fixed").addEventListener("change", () => { if (shown) fit(); });
 $("token").addEventListener("change", () => { token = $("token").value.trim(); sessionStorage.setItem("token", token); start(); });
 window.addEventListener("resize", resize);

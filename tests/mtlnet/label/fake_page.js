@@ -1,0 +1,78 @@
+// Runs label.js with a fake page and a fake server of four pictures, presses keys, and prints what
+// the server received and what the page shows, as JSON.
+// Usage: node fake_page.js LABEL_JS LABELLED KEYS
+// LABELLED: numbers of the labelled pictures, with commas between them. KEYS: names of keys with
+// commas between them; they are pressed without a pause. "." waits until all requests are answered,
+// "fail" makes the next request fail, "show N" opens picture N, "drag" edits the picture.
+"use strict";
+const fs = require("fs"), vm = require("vm");
+const [file, labelled, keys] = process.argv.slice(2);
+const has = [0, 1, 2, 3].map((n) => labelled.split(",").includes(String(n)));
+const elements = {}, onKey = [], received = [];
+let pending = 0, failing = false;
+
+const ink = new Proxy({}, { get: (of, name) => of[name] ?? (() => {}), set: () => true });
+const element = (id) => (elements[id] ||= {
+  id, value: "", textContent: "", style: {}, dataset: {}, width: 8, height: 6, on: {},
+  addEventListener(name, work) { this.on[name] = work; },
+  getContext: () => ink, getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {},
+});
+const pair = (value) => ({ left: structuredClone(value), right: structuredClone(value) });
+const picture = (n) => ({
+  file: `${n}.png`, width: 100, height: 75, camera_pitch_deg: 0, note: "",
+  row: has[n] ? { heading: "left" } : null, source: has[n] ? "label" : "model",
+  markings: { ml: -1 - n / 10, mr: 2, angle: 0, curvature: 0, pitch_deg: 0 },
+  lines: pair([[0, 0], [1, 75]]), handles: pair([[1, 70], [2, 60], [3, 50]]),
+});
+
+function answer(path, method, body) {
+  const n = Number(/pictures\/(\d+)/.exec(path)?.[1]);
+  if (path === "api/pictures") return { pictures: has.map((one, i) => ({ file: `${i}.png`, labelled: one })) };
+  if (path.endsWith("fit")) return { ...picture(n), markings: { ...picture(n).markings, ml: -1.77 } };
+  if (method === "GET") return picture(n);
+  received.push(method === "PUT" ? `PUT ${n} ${body.ml} ${body.heading}` : `DELETE ${n}`);
+  has[n] = method === "PUT";
+  return { file: `${n}.png` };
+}
+
+async function fetch(path, { method, body }) {
+  const ok = !failing;
+  failing = false;
+  pending++;
+  await new Promise((done) => setTimeout(done, 1));
+  pending--;
+  const told = ok ? answer(path, method, body && JSON.parse(body)) : { detail: "no answer" };
+  return { ok, status: ok ? 200 : 500, json: async () => told, blob: async () => ({}) };
+}
+
+const page = vm.createContext({
+  document: { getElementById: element, body: { dataset: {}, clientWidth: 800 } },
+  window: { innerHeight: 600, addEventListener: (name, work) => { if (name === "keydown") onKey.push(work); } },
+  location: { hash: "" }, sessionStorage: { getItem: () => null }, fetch, structuredClone,
+  createImageBitmap: async () => ({ width: 100, height: 75 }),
+});
+const source = fs.readFileSync(file, "utf8");
+vm.runInContext(`${source}; this.found = () => ({ number, labelled: pictures.map((one) => one.labelled), shown: shown && shown.file }); this.show = open;`, page);
+
+const press = (key) => onKey.forEach((work) => work({ key, target: { tagName: "BODY" }, preventDefault() {} }));
+async function settle() {
+  for (let idle = 0; idle < 3; idle = pending ? 0 : idle + 1) await new Promise((done) => setTimeout(done, 2));
+}
+function drag() {
+  const { on, style } = elements.picture, scale = parseFloat(style.width) / 100;
+  const at = (u, v) => ({ clientX: (u + 0.5) * scale, clientY: (v + 0.5) * scale, pointerId: 1 });
+  on.pointerdown(at(1, 70)); on.pointermove(at(5, 70)); on.pointerup(at(5, 70));
+}
+
+(async () => {
+  await settle();
+  for (const key of keys.split(",")) {
+    if (key === ".") await settle();
+    else if (key === "fail") failing = true;
+    else if (key === "drag") drag();
+    else if (key.startsWith("show ")) await page.show(Number(key.slice(5)));
+    else press(key);
+  }
+  await settle();
+  console.log(JSON.stringify({ ...page.found(), received, status: elements.status.textContent, stored: has }));
+})();

@@ -1,0 +1,63 @@
+"""The keys of the label page in node, with a fake page and a fake server (`fake_page.js`)."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mtlnet.label.server import PAGE
+
+pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+
+
+def press(labelled: str, keys: str) -> dict[str, Any]:
+    """Press `keys` on a page of four pictures; returns the state of the page and of the server."""
+    script = Path(__file__).with_name("fake_page.js")
+    command = ["node", str(script), str(PAGE / "label.js"), labelled, keys]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    found: dict[str, Any] = json.loads(done.stdout)
+    assert found["labelled"] == found["stored"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("labelled", "keys", "received", "number"),
+    [
+        # A key that is pressed during a save does not change what is saved.
+        ("0", "show 0,Enter,ArrowRight", ["PUT 0 -1 left"], 1),
+        ("0", "show 0,drag,Enter,ArrowRight", ["PUT 0 -1.77 left"], 1),
+        ("", "Enter,Enter", ["PUT 0 -1 "], 1),
+        ("", "Enter,ArrowRight", ["PUT 0 -1 "], 1),
+        ("", "Enter,3", ["PUT 0 -1 "], 1),
+        ("", "Enter,ArrowRight,.,u", ["PUT 0 -1 ", "DELETE 0"], 0),
+        ("", "Enter,.,Enter", ["PUT 0 -1 ", "PUT 1 -1.1 "], 2),
+        # The same holds for an undo and a removal.
+        ("", "Enter,.,u,ArrowRight", ["PUT 0 -1 ", "DELETE 0"], 0),
+        ("", "Enter,.,u,u", ["PUT 0 -1 ", "DELETE 0"], 0),
+        ("0,1", "show 0,x,ArrowRight", ["DELETE 0"], 0),
+        ("0,1", "show 0,x,x", ["DELETE 0"], 0),
+        # A picture that is not shown yet is not labelled, and its label is not removed.
+        ("", "ArrowRight,Enter", [], 1),
+        ("", "drag,ArrowRight,Enter", [], 1),
+        ("0,1", "show 0,ArrowRight,x", [], 1),
+        ("", "ArrowRight,ArrowRight", [], 2),
+    ],
+)
+def test_a_key_acts_on_the_picture_that_was_shown(
+    labelled: str, keys: str, received: list[str], number: int
+) -> None:
+    found = press(labelled, keys)
+    assert found["received"] == received
+    assert (found["number"], found["shown"]) == (number, f"{number}.png")
+
+
+def test_a_failed_request_is_shown_and_can_be_repeated() -> None:
+    found = press("0", "show 0,fail,Enter")
+    assert (found["received"], found["status"], found["number"]) == ([], "no answer", 0)
+    found = press("", "Enter,.,fail,u")
+    assert (found["received"], found["status"]) == (["PUT 0 -1 "], "no answer")
+    found = press("", "Enter,.,fail,u,.,u")
+    assert found["received"] == ["PUT 0 -1 ", "DELETE 0"]
