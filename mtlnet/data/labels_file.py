@@ -291,12 +291,16 @@ def lane_cells(ml: float, mr: float) -> Cells:
 
 def lane_sides(metres: Mapping[str, float | None]) -> tuple[float, float] | None:
     """Return the signed distances (left, right), m, to the two markings of one lane, from the
-    distances by name of the marking.
+    distances by name of the marking; None is an absent or unknown distance.
 
-    The pair is `ml` and `mr`; where these are absent, `m` and `r`; where `r` is absent too, `l` and
-    `m`. None if no pair is present.
+    The pair is `ml` and `mr`. Without it, the pair is the lane on the car's side of `m`: `l` and
+    `m` if `m` is right of the car, else `m` and `r`. Without this lane, the pair is the lane on the
+    far side of `m`. None if no pair is present. `trackfeatures.definitions.lane_offset` uses the
+    same order.
     """
-    for pair in (("ml", "mr"), ("m", "r"), ("l", "m")):
+    beside = ("l", "m"), ("m", "r")
+    is_right = (metres["m"] or 0.0) > 0
+    for pair in (("ml", "mr"), *(beside if is_right else reversed(beside))):
         left, right = (metres[name] for name in pair)
         if left is not None and right is not None:
             return left, right

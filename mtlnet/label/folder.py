@@ -28,6 +28,7 @@ from mtlnet.sources.kinds import SourceKind, kind_of
 from runtime.camera_file import write_camera
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
+from trackfeatures.definitions import MARKINGS
 from trackfeatures.errors import UserError
 from trackfeatures.road_class import BEND_CURVATURE
 
@@ -143,12 +144,7 @@ class LabelFolder:
         """Return the label of picture `number`, which `camera` took; None if the picture has no
         label, or if its label does not have the distances to both markings of a lane."""
         row = self.rows().get(self.files[number], {})
-        texts = {name: row.get(name) for name in ("ml", "mr", "l", "m", "r")}
-        known = {
-            name: float(text) if text not in (None, "", UNKNOWN) else None
-            for name, text in texts.items()
-        }
-        sides = lane_sides(known)
+        sides = lane_sides(_distances(row))
         if sides is None:
             return None
         curvature = float(row.get("curvature_1pm") or 0.0)
@@ -159,8 +155,9 @@ class LabelFolder:
 
         `heading` is the class of the road; if it is empty, the class follows from the curvature of
         the markings, which must then be correct 20 m ahead. `texts`: the cells of the columns
-        `drive` and `light`; a column that is missing in `texts` keeps its value. Raises UserError
-        for a label out of range.
+        `drive` and `light`; a column that is missing in `texts` keeps its value. If the lane is at
+        the same place as in the row's earlier label, the marking beyond the lane keeps its cell.
+        Raises UserError for a label out of range.
         """
         if not heading:
             bend = "left" if markings.curvature > 0 else "right"
@@ -168,12 +165,12 @@ class LabelFolder:
         with self._lock:
             rows = self.rows()
             name = self.files[number]
-            old = {k: v for k, v in rows.get(name, {}).items() if k in KEPT}
+            old = rows.get(name, {})
             row = {
-                **old,
+                **{k: v for k, v in old.items() if k in KEPT},
                 **{k: v for k, v in texts.items() if k in ("drive", "light")},
                 "file": name,
-                **lane_cells(markings.ml, markings.mr),
+                **_distance_cells(markings, old),
                 "angle": f"{markings.angle:.5f}",
                 "heading": heading,
                 "pitch_deg": f"{markings.pitch_deg:.3f}",
@@ -195,6 +192,27 @@ class LabelFolder:
             write_cells(self.folder / LABELS, [rows[k] for k in sorted(rows, key=natural_key)])
         else:
             (self.folder / LABELS).unlink(missing_ok=True)
+
+
+def _distances(row: Cells) -> dict[str, float | None]:
+    """Return the distances of a row, m, by name; None is an absent or unknown distance."""
+    texts = {name: row.get(name, "") for name in MARKINGS}
+    return {
+        name: float(text) if text not in ("", UNKNOWN) else None for name, text in texts.items()
+    }
+
+
+def _distance_cells(markings: Markings, old: Cells) -> Cells:
+    """Return the five cells of the lane `markings`. A cell that would be unknown keeps its text in
+    `old` if the lane and the marking `m` in the row `old` are at the same place, to 1 mm."""
+    cells = lane_cells(markings.ml, markings.mr)
+    before = _distances(old)
+    sides = lane_sides(before)
+    if sides is None or before["m"] is None or lane_cells(*sides) != cells:
+        return cells
+    if f"{before['m']:.3f}" != cells["m"]:
+        return cells
+    return {name: old[name] if text == UNKNOWN else text for name, text in cells.items()}
 
 
 def _version(path: Path) -> tuple[object, ...]:

@@ -183,3 +183,28 @@ def test_a_drag_neither_decodes_the_picture_nor_reads_the_labels_again(site: Sit
         (site.folder / "1.png").unlink()
         status, told, _ = site.ask("GET", "/api/pictures/0")
         assert (status, "1.png cannot be read" in told["detail"]) == (422, True)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "1.png,,,-3.300,0.300,3.900,0,?",  # the car drives on the right marking of its lane
+        "1.png,,,-3.900,-0.300,3.300,0,?",
+        "1.png,-2.600,1.000,-2.600,1.000,4.600,0,?",
+        "1.png,,,,0.300,3.900,0,?",  # left of the outermost marking
+        "1.png,-1,2.6,-4.6,-1,2.6,0,?",  # typed by hand
+        "1.png,-1,2.6,,-1,2.6,0,?",
+    ],
+)
+def test_a_label_that_is_saved_as_it_was_keeps_all_its_distances(site: Site, row: str) -> None:
+    table = site.folder / "labels.csv"
+    table.write_text(f"file,ml,mr,l,m,r,angle,heading\n{row}\n")
+    _, before = read_labels(table)
+    _, shown, _ = site.ask("GET", "/api/pictures/0")
+    assert shown["source"] == "label"
+    assert site.ask("PUT", "/api/pictures/0/label", shown["markings"])[0] == 200
+    np.testing.assert_array_equal(read_labels(table)[1].distances, before.distances)
+    # In another lane, or another place, the marking beyond it is unknown.
+    moved = {**shown["markings"], "ml": shown["markings"]["ml"] - 0.01}
+    site.ask("PUT", "/api/pictures/0/label", moved)
+    assert np.isinf(read_labels(table)[1].distances).sum() == 1
