@@ -8,7 +8,7 @@ from typing import Any
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.sources.pictures import Picture, other_size
 from mtlnet.sources.recordings.cameras import calibration_topic, camera_of
-from mtlnet.sources.recordings.coded_film import CodedFilm
+from mtlnet.sources.recordings.coded_film import CodedFilm, Packet
 from mtlnet.sources.recordings.containers import Container, names_of, open_container
 from mtlnet.sources.recordings.images import (
     IMAGES,
@@ -107,10 +107,14 @@ class Recording:
             return Picture(number, None, time_ns / NANOSECONDS, error=f"{where}: {error}")
         return Picture(number, image, time_of(message) or time_ns / NANOSECONDS)
 
-    def _packets(self) -> Iterator[tuple[float, str, bytes]]:
+    def _packets(self) -> Iterator[Packet | ImageError]:
         read = self._reader()
         for time_ns, data in self.container.messages(self.topic.name):
-            message = read(data)
+            try:
+                message = read(data)
+            except ImageError as error:
+                yield error
+                continue
             yield time_of(message) or time_ns / NANOSECONDS, message.format, message.data
 
 

@@ -1,10 +1,7 @@
 """`mtlnet predict` on Foxglove files and ROS 2 bags, written by their official writers."""
 
 import json
-import re
-import subprocess
 import sys
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -196,59 +193,6 @@ def test_pictures_that_change_their_size_end_the_recording(
     with pytest.raises(InputsLeftOut, match=message) as raised:
         predict_files(engine, [str(bag)])
     assert len(raised.value.results) == 2
-
-
-@pytest.mark.parametrize(("form", "codec"), [("h264", "libx264"), ("h265", "libx265")])
-def test_compressed_video_gives_the_pictures_of_its_film(
-    engine: BrightnessEngine, tmp_path: Path, form: str, codec: str
-) -> None:
-    """One picture per message (Annex B), as Foxglove defines it; a picture of another size ends
-    it."""
-    program = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
-
-    def encoded(name: str, size: str) -> Path:
-        source = f"gradients=size={size}:rate=10:duration=0.8:speed=0.2:seed=3"
-        quiet = ["-x265-params", "log-level=none:bframes=0"] if form == "h265" else ["-bf", "0"]
-        path = tmp_path / name
-        command = [program, "-v", "error", "-f", "lavfi", "-i", source, "-c:v", codec, *quiet]
-        subprocess.run([*command, "-pix_fmt", "yuv420p", str(path)], check=True)
-        return path
-
-    film = encoded(f"a.{form.replace('h265', 'hevc')}", "560x420")
-    expected = answers(predict_files(engine, [str(film)]))
-    assert len({row["angle_rad"] for row in expected}) > 4
-    units = access_units(film.read_bytes(), form)
-    assert len(units) == len(expected) == 8
-    video: list[Message] = [
-        ("/video", "CompressedVideo", {"data": unit, "format": form}) for unit in units
-    ]
-    path = write_foxglove(tmp_path / "video.mcap", video)
-    rows = predict_files(engine, [str(path)])
-    assert answers(rows) == expected
-    times = [row["time_s"] - START_S for row in rows]
-    assert times == pytest.approx([0.05 * n for n in range(8)], abs=1e-6)
-    late = write_foxglove(tmp_path / "late.mcap", video[1:])  # without its first key frame
-    with pytest.raises(UserError, match=r"no frame of it .*can be decoded|cannot be decoded"):
-        predict_files(engine, [str(late)])
-    other = [("/video", "CompressedVideo", {"data": b"?", "format": "mpeg2"})]
-    with pytest.raises(UserError, match="its format 'mpeg2' is not read; known are h264, h265"):
-        predict_files(engine, [str(write_foxglove(tmp_path / "other.mcap", other))])
-
-
-def access_units(stream: bytes, form: str) -> list[bytes]:
-    """The pictures of an Annex B stream with one slice per picture, each with the preceding
-    units."""
-    starts = [m.start() for m in re.finditer(rb"\x00?\x00\x00\x01", stream)] + [len(stream)]
-    units, pending = [], b""
-    for begin, end in pairwise(starts):
-        unit = stream[begin:end]
-        head = unit.lstrip(b"\0")[1]
-        pending += unit
-        is_picture = 1 <= head & 31 <= 5 if form == "h264" else (head >> 1 & 63) < 32
-        if is_picture:
-            units.append(pending)
-            pending = b""
-    return units
 
 
 @pytest.mark.slow
