@@ -74,7 +74,8 @@ class Film:
         number = used = lost = 0
         damaged_at = -1
         while lost < MAX_LOST:
-            found, frame = film.read()
+            with errors.reading():
+                found, frame = film.read()
             if errors.count and damaged_at < 0:
                 damaged_at = number
             if not found:
@@ -123,7 +124,7 @@ def _open(path: Path, errors: DecodingErrors) -> cv2.VideoCapture:
     OpenCV gets the path of an open file descriptor: it would end the process at a name that is not
     UTF-8, and FFmpeg takes a name with a colon for a protocol.
     """
-    with _opened(path) as name, silent_opencv():
+    with _opened(path) as name, silent_opencv(), errors.opening():
         film = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     if not film.isOpened():
         told = f" ({errors.first})" if errors.first else ""

@@ -72,7 +72,8 @@ class Stream:
             number, waited_s = 0, 0.0
             while True:
                 begin = time.monotonic()
-                found, frame = self.film.read()
+                with self.errors.reading():
+                    found, frame = self.film.read()
                 took_s = time.monotonic() - begin
                 # After a stall the decoder returns at once the pictures that it has kept.
                 waited_s = took_s if took_s > AT_ONCE_S else max(waited_s, took_s)
@@ -133,7 +134,7 @@ def open_stream(given: str) -> Stream:
         cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(1e3 * OPEN_S),
         cv2.CAP_PROP_READ_TIMEOUT_MSEC, int(1e3 * STALL_S),
     ]  # fmt: skip
-    with silent_opencv():
+    with silent_opencv(), errors.opening():
         if scheme:
             film = cv2.VideoCapture(given, cv2.CAP_FFMPEG, limits)
         else:

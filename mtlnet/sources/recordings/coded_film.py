@@ -78,12 +78,13 @@ class CodedFilm:
     def _decoded(self, path: Path) -> Iterator[Picture]:
         used = 0
         with decoding_errors() as errors:
-            with silent_opencv():
+            with silent_opencv(), errors.opening():
                 film = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
             try:
                 errors.forget()
                 while film.isOpened():
-                    found, frame = film.read()
+                    with errors.reading():
+                        found, frame = film.read()
                     if not found:
                         break
                     counted = self._written[min(used, len(self._written) - 1)]

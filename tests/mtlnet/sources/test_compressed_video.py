@@ -97,5 +97,5 @@ def test_an_unreadable_message_loses_only_its_own_picture(tmp_path: Path, form: 
             recording.fault
         )
     only = write_foxglove(tmp_path / "c.mcap", [broken], as_json=True)
-    with pytest.raises(UserError, match="none of its messages can be read .the message is not"):
+    with pytest.raises(UserError, match=r"none of its messages can be read .the message is not"):
         list(open_recording(only).pictures())
