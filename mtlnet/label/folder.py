@@ -92,14 +92,22 @@ class LabelFolder:
         """Return the rows of `labels.csv`, each a dict from column to text, by the name of the
         picture's file; an empty dict if there is no `labels.csv`.
 
-        The file is read again when it has changed. Do not change the returned dictionary.
+        The file is read again when it has changed. Do not change the returned dictionary. Raises
+        UserError with the line of a faulty row.
         """
         path = self.folder / LABELS
         if not path.is_file():
             return {}
         version = _version(path)
         if self._rows[0] != version:
-            self._rows = version, {cells["file"]: cells for _, cells in read_cells(path)}
+            rows = {}
+            for line, cells in read_cells(path):
+                try:
+                    check_cells(cells)
+                except UserError as error:
+                    raise UserError(f"{path}, line {line}: {error}") from None
+                rows[cells["file"]] = cells
+            self._rows = version, rows
         return self._rows[1]
 
     def picture(self, number: int) -> NDArray[np.uint8]:

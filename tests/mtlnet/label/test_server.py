@@ -208,3 +208,22 @@ def test_a_label_that_is_saved_as_it_was_keeps_all_its_distances(site: Site, row
     moved = {**shown["markings"], "ml": shown["markings"]["ml"] - 0.01}
     site.ask("PUT", "/api/pictures/0/label", moved)
     assert np.isinf(read_labels(table)[1].distances).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("row", "fault"),
+    [("1.png,-1,2.6,,,,,?", "angle is '', not"), ("1.png,x,2.6,,,,0,?", "ml is 'x', not a number")],
+)
+def test_a_faulty_row_is_refused_at_the_start_and_later(site: Site, row: str, fault: str) -> None:
+    table = site.folder / "labels.csv"
+    table.write_text(f"file,ml,mr,l,m,r,angle,heading\n10.png,-1,2.6,,,,0,?\n{row}\n")
+    for method, path, body in (
+        ("GET", "/api/pictures/0", None),
+        ("PUT", "/api/pictures/1/label", LABEL),
+    ):
+        status, told, _ = site.ask(method, path, body)
+        assert status == 422
+        assert told["detail"].startswith(f"labels.csv, line 3: {fault}")
+    with pytest.raises(UserError, match=rf"labels\.csv, line 3: {fault}"):
+        LabelFolder(site.folder, None, CameraParameters())
+    assert row in table.read_text()
