@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from runtime.files import atomic_write
-from trackfeatures.coding import UNKNOWN_M
+from trackfeatures.coding import IN_LANE_WIDTH_LIMIT_M, UNKNOWN_M
 from trackfeatures.errors import UserError
 from trackfeatures.road_class import UNKNOWN_HEADING
 
@@ -32,12 +32,15 @@ MAY_BE_UNKNOWN = ("l", "m", "r", "heading")
 MARKING_LIMITS_M = {
     "ml": (-5.5, -0.5),
     "mr": (0.5, 5.5),
-    "l": (-7.0, -1.5),
-    "m": (-2.0, 2.75),
-    "r": (1.5, 7.0),
+    "l": (-6.7, -1.5),
+    "m": (-2.0, 2.7),
+    "r": (1.5, 6.7),
 }
 """Allowed distances, m. The network's coding would clip a distance outside its range, and would
-read `m` as absent above 2.75 m."""
+read `m` as absent from 2.75 m, and `l` and `r` from 6.75 m from the car."""
+MAX_LANE_WIDTH_M = IN_LANE_WIDTH_LIMIT_M - 1e-3
+"""Maximum of `mr - ml`, m. The coding would read a wider lane as absent; the margin of 1 mm covers
+the rounding to float32."""
 ANGLE_LIMIT_RAD = 0.5
 ROAD_CLASSES = {kind.name.lower(): int(kind) for kind in tf.RoadClass}
 
@@ -215,6 +218,11 @@ def _parse(line: int, cells: Cells) -> tuple[LabelledPicture, list[float], float
 def _check_pairs(found: dict[str, float]) -> None:
     if math.isnan(found["ml"]) != math.isnan(found["mr"]):
         raise ValueError("ml and mr are the two sides of one lane: give both or none")
+    if found["mr"] - found["ml"] > MAX_LANE_WIDTH_M:
+        raise ValueError(
+            f"the lane from ml to mr is {found['mr'] - found['ml']:g} m wide; it must be under "
+            f"{IN_LANE_WIDTH_LIMIT_M:g} m, because a wider lane would count as absent"
+        )
     beside = (found["l"], found["r"])
     if math.isnan(found["m"]) and not all(map(math.isnan, beside)):
         raise ValueError("l and r are the markings next to m: without m they must be empty")
