@@ -2,6 +2,7 @@
 
 import hashlib
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -71,17 +72,21 @@ def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
 
 def require_camera(card: ModelCard, camera: CameraParameters) -> None:
     """Raise ModelError when `camera`, the camera of the data, differs from the model's camera."""
-    found, expected = camera.as_dict(), card.camera.as_dict()
+    found, expected = asdict(camera), asdict(card.camera)
     if found != expected:
         differing = ", ".join(
-            f"{k} {found[k]:g} instead of {expected[k]:g}"
-            for k in expected
-            if found[k] != expected[k]
+            f"{name} {_text(found[name])} instead of {_text(expected[name])}"
+            for name in expected
+            if found[name] != expected[name]
         )
         raise ModelError(
             f"the camera of the data is not that of model {card.name}: {differing}; collect with "
             "the model's camera, or train a model for this one"
         )
+
+
+def _text(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def find_undecodable(frames: Frames) -> dict[int, UndecodableImage]:
