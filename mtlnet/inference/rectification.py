@@ -81,10 +81,11 @@ class Rectification:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         seen = source.resized(image.shape[1], image.shape[0])
         grey = (BORDER_LEVEL,) * 3
-        if seen.distortion == "none":
+        way = target.homography(seen)
+        if seen.distortion == "none" and _is_ahead(target, way):
             found = cv2.warpPerspective(
                 image,
-                target.homography(seen),
+                way,
                 (target.width, target.height),
                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
                 borderMode=cv2.BORDER_CONSTANT,
@@ -177,6 +178,14 @@ def _aside(camera: CameraParameters, angle: NDArray[np.floating]) -> Metres:
     road, for cars that point `angle` (N,) rad to the right of the road."""
     left: Metres = camera.y * np.cos(angle) - camera.x * np.sin(angle)
     return left[:, None]
+
+
+def _is_ahead(target: CameraParameters, way: Metres) -> bool:
+    """Return whether the whole view of `target` is in front of the camera to whose pixels the
+    homography `way` (3, 3) leads. A homography also maps directions behind a camera to pixels."""
+    right, bottom = target.width - 1, target.height - 1
+    corners = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1]])
+    return bool((corners @ way[2] > 0).all())
 
 
 @lru_cache(maxsize=KEPT_MAPS)

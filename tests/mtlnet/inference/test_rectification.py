@@ -1,6 +1,7 @@
 """Images of other cameras: pixels against a projection, and answers in metres of a flat road."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -193,3 +194,19 @@ def test_an_image_without_road_or_of_another_shape_is_refused() -> None:
         upwards.image(np.zeros((210, 280, 3), np.uint8))
     with pytest.raises(ImageError, match="560 x 400 px, its camera gives 280 x 210"):
         Rectification(MODEL, MODEL).image(np.zeros((400, 560, 3), np.uint8))
+
+
+@pytest.mark.parametrize("kind", ["none", "opencv"])
+@pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(75.0, 0.0), (-80.0, 0.0), (0.0, 80.0)])
+def test_what_is_behind_the_camera_is_grey(yaw_deg: float, pitch_deg: float, kind: str) -> None:
+    """A pixel of the view has the grey of the border exactly where its direction is not seen."""
+    wide = replace(MODEL, fov_y_deg=120.0, yaw_deg=yaw_deg, pitch_deg=pitch_deg)
+    source = replace(wide, distortion=kind, coefficients=(0.0,) * 4 if kind == "opencv" else ())
+    lens = Rectification(source, MODEL)
+    with patch.object(Rectification, "check"):  # it would refuse the picture: it shows too little
+        found = lens.image(np.full((420, 560, 3), 200, np.uint8))
+    columns, rows = np.meshgrid(np.arange(MODEL.width), np.arange(MODEL.height))
+    rays = MODEL.rays(np.column_stack([columns.ravel(), rows.ravel()])) @ MODEL.rotation()
+    is_ahead = (rays @ wide.rotation().T)[:, 2].reshape(rows.shape) > 0
+    assert (found[~is_ahead] == BORDER_LEVEL).all()
+    assert 0.05 < (~is_ahead).mean() < 0.9
