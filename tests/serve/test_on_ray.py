@@ -125,7 +125,11 @@ def test_cameras_and_views_reach_the_replicas(
 ) -> None:
     on_ray_module = pytest.importorskip("serve.on_ray", reason="no ray[serve]")
     deployed: list[Any] = []
-    take = MagicMock(side_effect=lambda found: deployed.append(found) or MagicMock())
+
+    def take(application: Any) -> MagicMock:
+        deployed.append(application)
+        return MagicMock()
+
     monkeypatch.setattr(on_ray_module.ray_serve, "ingress", take)
     monkeypatch.setattr(on_ray_module.ray_serve, "deployment", lambda **_: MagicMock())
     monkeypatch.delenv("DRIVERVIEW_TOKEN", raising=False)
