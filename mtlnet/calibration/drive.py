@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtlnet.calibration.film import DriveCalibration, DriveEstimate
+from mtlnet.calibration.film import KEPT, DriveCalibration, DriveEstimate
 from mtlnet.calibration.lens import KnownLens
 from mtlnet.calibration.mount import NotCalibrated
 from mtlnet.inference.image_decoding.decode import read_whole_image
@@ -36,12 +36,13 @@ numbers of pictures."""
 
 @dataclass(frozen=True)
 class CalibratedDrive:
-    """The estimated camera, up to six of the pictures, and a text about damage of the film (empty
-    if there is none)."""
+    """The estimated camera, up to six of the pictures, a text about damage of the film, and a text
+    about pictures that were not used; a text is empty if there is none of them."""
 
     found: DriveEstimate
     shown: list[Picture]
     fault: str = ""
+    unused: str = ""
 
 
 def calibrate_film(
@@ -87,18 +88,24 @@ def calibrate_pictures(
     lane_width_m: float | None = None,
     report: Report = lambda done, total: None,
 ) -> CalibratedDrive:
-    """Estimate the camera of the pictures `paths` of a drive, which are in the order of time.
+    """Estimate the camera of the pictures `paths` of a drive, which are in the order of time. Of
+    more than 600 pictures, 600 that are spread evenly over the drive are used.
 
     `make_lens`, `lane_width_m`: as for `calibrate_film`; `report(done, total)` is called with
     numbers of pictures. Raises NotCalibrated if too few pictures show a marked straight road.
     """
 
+    count = min(len(paths), KEPT)
+    used = [paths[i] for i in np.linspace(0, len(paths) - 1, count).astype(int).tolist()]
+
     def timed() -> Iterator[tuple[float, Picture]]:
-        for number, path in enumerate(paths):
-            report(float(number), float(len(paths)))
+        for number, path in enumerate(used):
+            report(float(number), float(count))
             yield PICTURE_S * number, read_whole_image(path)
 
-    return CalibratedDrive(*_calibrate(timed(), make_lens, lane_width_m, len(paths) / SHOWN))
+    found, shown = _calibrate(timed(), make_lens, lane_width_m, count / SHOWN)
+    unused = f"{count} of {len(paths)} pictures were used, spread evenly over the drive"
+    return CalibratedDrive(found, shown, unused=unused if count < len(paths) else "")
 
 
 def _calibrate(

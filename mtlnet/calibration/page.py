@@ -90,7 +90,7 @@ def write_drive_page(path: Path, drive: CalibratedDrive, name: str) -> None:
             "mtlnet.calibration",
             "page.html",
             title=f"Camera of {name}",
-            lines=[found.about()],
+            lines=[text for text in (found.about(), drive.unused) if text],
             head=["", "found", "standard deviation"],
             rows=[
                 [what, f"{value:.2f}", f"{spread:.2f}"]

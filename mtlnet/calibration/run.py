@@ -138,7 +138,7 @@ def _with_exif(path: Path) -> Path | None:
 
 
 def _write_drive(config: CalibrateConfig, drive: CalibratedDrive) -> tuple[dict[str, Any], str]:
-    line = drive.found.about()
+    line = drive.found.about() + (f"; {drive.unused}" if drive.unused else "")
     write_camera(config.out, drive.found.camera, f"mtlnet calibrate: {line}")
     if config.page is not None:
         from mtlnet.calibration.page import write_drive_page

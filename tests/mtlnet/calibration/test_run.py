@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, patch
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from mtlnet.calibration.config import CalibrateConfig
 from mtlnet.calibration.run import calibrate
+from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.lenses import DriveLens, with_lens
 from mtlnet.sources.find import Source
@@ -64,6 +66,24 @@ def test_pictures_of_a_drive_in_a_row(tmp_path: Path) -> None:
     result, line = calibrate(config)
     assert result["pitch_deg"] == pytest.approx(2.0, abs=0.15)
     assert "lane width 3.6 m, assumed; field of view 60 deg, given" in line
+
+
+def test_of_many_pictures_some_from_the_whole_drive_are_used(tmp_path: Path) -> None:
+    names = [f"{number}.png" for number in range(38)]
+    for name in names:
+        cv2.imwrite(str(tmp_path / name), road_picture(CAMERA, MARKINGS_M))
+    page = tmp_path / "page.html"
+    config = CalibrateConfig(
+        [str(tmp_path)], tmp_path / "c.yaml", drive=True, fov_y_deg=60.0, page=page
+    )
+    read = Mock(side_effect=read_whole_image)
+    with patch.multiple("mtlnet.calibration.drive", KEPT=15, read_whole_image=read):
+        _, line = calibrate(config)
+    assert [names.index(call.args[0].name) for call in read.call_args_list] == [
+        0, 2, 5, 7, 10, 13, 15, 18, 21, 23, 26, 29, 31, 34, 37,
+    ]  # fmt: skip
+    assert line.endswith("; 15 of 38 pictures were used, spread evenly over the drive")
+    assert "15 of 38 pictures were used" in page.read_text()
 
 
 def test_a_board_becomes_a_camera_file(tmp_path: Path) -> None:
