@@ -128,6 +128,8 @@ def test_what_cannot_be_calibrated_is_one_line(film: Path, tmp_path: Path) -> No
         ([film, "--board", "9x6"], "--board and --fisheye are for pictures of a board"),
         ([picture, "--drive", "--fisheye"], "--board and --fisheye are for pictures of a board"),
         ([picture, "--fov", 60], "--lane-width are for a drive; for pictures of a drive give"),
+        ([picture, "--camera", film], "--lane-width are for a drive; for pictures of a drive"),
+        ([picture, "--photo", picture], "--lane-width are for a drive; for pictures of a drive"),
         ([picture, "--lane-width", 3], "--lane-width are for a drive; for pictures of a drive"),
     ]
     for given, seen in cases:
