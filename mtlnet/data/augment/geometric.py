@@ -57,7 +57,8 @@ def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
 
     `distances` (N, 5) in m, NaN where absent, infinity where the label is unknown. Beyond a limit,
     a distance to a marking that is not labelled would be needed. A marking with an unknown label
-    sets no limit for a car that has `ml` and `mr`; without these it allows no shift.
+    sets no limit for a car that has `ml` and `mr`; without these it allows no shift. A car without
+    any marking, more than 2 m outside the road, is not shifted.
     """
     unknown = np.isinf(distances)
     ml, mr, l, m, r = np.where(unknown, np.nan, distances).astype(np.float64).T
@@ -72,7 +73,8 @@ def shift_limits_m(distances: NDArray[np.float32]) -> NDArray[np.float64]:
     low = np.where(on_marking, np.maximum(low, -most - m), low)
     high = np.where(on_marking, np.minimum(high, most - m), high)
     outside = on_marking & ((np.isnan(l) & (m > 0)) | (np.isnan(r) & (m < 0)))
-    nowhere = ~in_lane & unknown.any(1)
+    # A car far outside the road has no marking; where one would come into view is not labelled.
+    nowhere = ~in_lane & (unknown.any(1) | ~on_marking)
     low[outside | nowhere] = high[outside | nowhere] = 0.0
     return np.column_stack([low.clip(max=0.0), high.clip(min=0.0)])
 

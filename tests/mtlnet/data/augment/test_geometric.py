@@ -17,6 +17,7 @@ from mtlnet.data.augment.geometric import (
 )
 from tests.mtlnet.data.augment.samples import pixel_of
 from trackfeatures.camera import CameraParameters
+from trackfeatures.definitions import OUTSIDE_REACH_M
 
 
 @pytest.mark.parametrize("yaw_change", [-0.08, 0.03])
@@ -68,7 +69,7 @@ def test_lateral_shift_matches_projection(metres: float, pitch_deg: float) -> No
 def test_shifted_labels_are_those_measured_at_the_shifted_position() -> None:
     moved = 0
     for lanes in (1, 2, 3):
-        positions = np.arange(-2.0 * lanes - 1.5, 2.0 * lanes + 1.5, 0.07)
+        positions = np.arange(-2.0 * lanes - 3.03, 2.0 * lanes + 3.0, 0.07)
 
         def measured(at: float, lanes: int = lanes) -> list[float]:
             found = tf.measure(at, 0.0, 0.0, 0.0, lanes, 4.0).distances.values()
@@ -80,6 +81,11 @@ def test_shifted_labels_are_those_measured_at_the_shifted_position() -> None:
             moved += int((np.abs(metres) > 0.25).sum())
             after = np.array([measured(at) for at in positions + metres])
             np.testing.assert_allclose(before + metres[:, None], after, atol=1e-5)
+        # A car up to 2 m outside has a labelled marking; farther out it is not moved, because the
+        # shift could make a marking visible that the label calls absent.
+        is_far = np.abs(positions) > 2.0 * lanes + OUTSIDE_REACH_M
+        np.testing.assert_array_equal(np.isnan(before).all(1), is_far)
+        assert not lateral_shift_m(np.full(len(positions), 0.98), before)[is_far].any()
     assert moved > 400  # of about 600: most can be shifted
 
 
