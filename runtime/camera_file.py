@@ -6,6 +6,7 @@ format for the mount.
 """
 
 import re
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from math import isfinite
@@ -233,7 +234,8 @@ def _plain(content: dict[str, Any], keys: Any) -> dict[str, Any]:
 
 
 def _whole(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+    is_whole = value.is_integer() if isinstance(value, float) else isinstance(value, int)
+    if isinstance(value, bool) or not is_whole:
         raise CameraError(f"{name} is {value!r}; give a whole number of pixels")
     return int(value)
 
@@ -241,11 +243,13 @@ def _whole(name: str, value: Any) -> int:
 def _number(name: str, value: Any) -> float:
     if isinstance(value, str):  # YAML 1.1 reads 1e-05 as text, and OpenCV writes .Nan
         try:
-            value = float(value.lstrip("."))
+            value = float(value.removeprefix(".") if value[1:].isalpha() else value)
         except ValueError:
             raise CameraError(f"{name} is {value!r}; give a number") from None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise CameraError(f"{name} is {value!r}; give a number")
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        raise CameraError(f"{name} is {str(value)[:9]}...; give a number below 1e308")
     return value
 
 

@@ -80,6 +80,9 @@ def test_files_that_opencv_writes(tmp_path: Path, suffix: str, header: str, name
          replace(LENS, coefficients=(*D, 0.1, 0.2, 0.3))),
         (ROS + "height_above_road_m: 1.5\nyaw_deg: -2\n", replace(LENS, z=1.25, yaw_deg=-2)),
         (KALIBR + "pitch_deg: 3\nx: 1.5\n", replace(FISHEYE, pitch_deg=3, x=1.5)),
+        # Numbers that YAML reads as text.
+        ("x: .5e0\nz: '.5'\npitch_deg: '-.5e0'\nyaw_deg: 1e-05\n",
+         replace(MODEL, x=0.5, z=0.5, pitch_deg=-0.5, yaw_deg=1e-05)),
         # A file of an older version, without `matrix`.
         ("width: 640\nheight: 360\nfov_y_deg: 40\nz: 1.25\npitch_deg: 1\n",
          CameraParameters(640, 360, 40.0, z=1.25, pitch_deg=1.0)),
@@ -145,6 +148,13 @@ def test_what_is_chosen_or_assumed_is_said(tmp_path: Path) -> None:
         ("height_std: 2\n", "height_std is 2"),
         ("yaw_deg: 200\n", "yaw_deg is 200; give -180 to 180"),
         ("roll_deg: .nan\n", "roll_deg is nan"),
+        ("roll_deg: .Nan\n", "roll_deg is nan"),  # text in YAML
+        ("x: ..5\n", "x is '..5'; give a number"),
+        ("width: .inf\n", "width is inf; give a whole number of pixels"),
+        ("height: .nan\n", "height is nan; give a whole number of pixels"),
+        (ROS.replace("image_width: 1280", "image_width: .inf"), "image_width is inf; give a whole"),
+        (f"x: 1{'0' * 400}\n", "x is 1000.*; give a number below 1e308"),
+        (ROS.replace("0.05]", f"1{'0' * 400}]"), "give a number below 1e308"),
         ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix 3\n", "not a mapping"),
         ("%YAML:1.0\n---\ncamera_matrix: !!python/object:os.system {}\n", "could not determine"),
     ],
