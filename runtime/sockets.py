@@ -16,6 +16,7 @@ from trackfeatures.errors import UserError
 
 LOOPBACKS = {socket.AF_INET: "127.0.0.1", socket.AF_INET6: "::1"}
 CONNECT_S = 0.25  # least time to connect to one address, unless less time remains in total
+MAX_PORT = 65535
 PORT_TRIES = 8  # attempts to find one port that is free on every address of a host
 # Errors of a machine that lacks IPv4 or IPv6. The addresses of the other protocol are used then.
 NO_FAMILY = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUPPORT)
@@ -102,11 +103,14 @@ def _bind(address: Address) -> socket.socket:
 
 
 def _addresses(host: str, port: int, flags: int = 0) -> list[Address]:
-    """Return the TCP addresses of `host`, without duplicates.
+    """Return the TCP addresses of `host`, without duplicates. Raises OSError for a port above
+    65535 or below 0, of which `getaddrinfo` would use the last 16 bits.
 
     For "localhost" the result always contains both loopback addresses (RFC 6761, 6.3), also if one
     of them is missing in /etc/hosts.
     """
+    if not 0 <= port <= MAX_PORT:
+        raise OSError(errno.EINVAL, f"ports are 0 to {MAX_PORT}")
     hosts = [host]
     if is_localhost(host):
         hosts += LOOPBACKS.values()

@@ -25,6 +25,16 @@ def test_an_invalid_host_is_refused() -> None:
         bind("a..b", 8000)
 
 
+@pytest.mark.parametrize("port", [-1, 65536, 70000])
+def test_a_port_out_of_range_is_refused(port: int) -> None:
+    for listen in (bind, bind_all):
+        with pytest.raises(UserError, match=rf"port {port}: ports are 0 to 65535"):
+            listen("127.0.0.1", port)
+    for host in ("127.0.0.1", "localhost"):
+        with pytest.raises(OSError, match="ports are 0 to 65535"):
+            connect((host, port), 5)
+
+
 def test_a_refused_address_leaves_no_socket_open() -> None:
     with bind("127.0.0.1", 0) as listener:
         listener.listen()
