@@ -181,11 +181,12 @@ def record_plan(
     Ctrl-C.
     """
     from datagen.execution.collect import collect as run
-    from datagen.execution.progress import progress_bar
+    from datagen.execution.progress import frames_of, progress_bar
     from datagen.planning.summary import overview
+    from datagen.recording.folder import read_states
 
     rounds = plan.rounds if shard is None else shard.select(plan.rounds)
-    frames = sum(entry.frames for entry in rounds)
+    frames = sum(frames_of(rounds, read_states(folder)).values())
     try:
         with progress_bar(len(rounds), frames, overview(plan, classes)) as progress:
             return run(

@@ -29,9 +29,8 @@ from datagen.recording.folder import (
     round_path,
     write_if_changed,
 )
-from datagen.recording.manifest import rebuild
-from datagen.recording.names import SIDES
-from datagen.recording.splits import Split, split_path, write_split
+from datagen.recording.manifest import planned_split, rebuild
+from datagen.recording.splits import split_path, write_split
 
 if TYPE_CHECKING:
     from datagen.recorder.record import MakeLaw
@@ -97,7 +96,7 @@ def collect(
         with setup_lock(folder):
             initialise_folder(folder, plan)
         _remove_leftovers(folder, rounds)
-        counter = CollectProgress(rounds, read_states(folder).keys(), progress)
+        counter = CollectProgress(rounds, read_states(folder), progress)
         missing = [entry for entry in rounds if entry.id not in counter.finished]
         pool = make_pool(executor, workers, counter.on_message)
         try:
@@ -124,7 +123,8 @@ def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str |
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
         if not finished or (shard is not None and len(finished) < len(plan.rounds)):
             return None
-        return str(rebuild(folder, split_of(plan, set(finished)))["content_hash"])
+        split = planned_split(folder, sides_of(plan), finished)
+        return str(rebuild(folder, split)["content_hash"])
 
 
 def _failure_message(failures: Sequence[Failure], planned: int) -> str:
@@ -229,14 +229,10 @@ def initialise_folder(folder: Path, plan: Plan) -> None:
     # The plan is written first, because the same command needs it to continue after a failure.
     write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
-    write_split(split_path(folder), split_of(plan, {entry.id for entry in plan.rounds}))
+    sides = sides_of(plan)
+    write_split(split_path(folder), planned_split(folder, sides, sides))
 
 
-def split_of(plan: Plan, finished: set[str]) -> Split:
-    """Return the plan's split with only the rounds whose ids are in `finished`."""
-    return Split(
-        **{
-            side: tuple(e.id for e in plan.rounds if e.split == side and e.id in finished)
-            for side in SIDES
-        }
-    )
+def sides_of(plan: Plan) -> dict[str, str]:
+    """Return the side of the split of each planned round by id."""
+    return {entry.id: entry.split for entry in plan.rounds}

@@ -30,9 +30,7 @@ from datagen.recording.folder import (
     round_path,
     write_if_changed,
 )
-from datagen.recording.manifest import rebuild
-from datagen.recording.names import SIDES
-from datagen.recording.splits import Split
+from datagen.recording.manifest import planned_split, rebuild
 from runtime.files import file_hash
 
 
@@ -107,8 +105,7 @@ def _derive(out: Path, planned: Mapping[str, str]) -> tuple[dict[str, RoundState
     if not states:
         end_merge(out)
         raise DatasetError("no folder has a finished round of the plan; record a shard first")
-    sides = {side: tuple(i for i in states if planned[i] == side) for side in SIDES}
-    return states, rebuild(out, Split(**sides))
+    return states, rebuild(out, planned_split(out, planned, states))
 
 
 def _read_plan(folder: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Counts the progress of a collection from the executor's messages, and shows it as a bar."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from rich.text import Text
 
 from datagen.planning.plan import RoundPlan
 from datagen.recorder.job import FramesDone, RoundDone
+from datagen.recording.folder import RoundState
 
 
 class ProgressCallback(Protocol):
@@ -49,13 +50,16 @@ class CollectResult:
 
 
 class CollectProgress:
-    """Counts finished frames of `rounds`; `finished` are the ids of rounds from earlier runs."""
+    """Counts finished frames of `rounds`; `states` are those of rounds from earlier runs, by id."""
 
     def __init__(
-        self, rounds: Sequence[RoundPlan], finished: Collection[str], progress: ProgressCallback
+        self,
+        rounds: Sequence[RoundPlan],
+        states: Mapping[str, RoundState],
+        progress: ProgressCallback,
     ) -> None:
-        self._frames_of = {entry.id: entry.frames for entry in rounds}
-        self.finished = [round_id for round_id in self._frames_of if round_id in finished]
+        self._frames_of = frames_of(rounds, states)
+        self.finished = [round_id for round_id in self._frames_of if round_id in states]
         self._before = self._done()
         self._running: dict[str, int] = {}
         self._resets = 0
@@ -86,6 +90,12 @@ class CollectProgress:
 
     def _done(self) -> int:
         return sum(self._frames_of[round_id] for round_id in self.finished)
+
+
+def frames_of(rounds: Sequence[RoundPlan], states: Mapping[str, RoundState]) -> dict[str, int]:
+    """Return the number of frames of each round by id: the planned number or, for a finished round,
+    the number in its state. A recovered round has fewer frames than planned."""
+    return {e.id: states[e.id].frames if e.id in states else e.frames for e in rounds}
 
 
 class FramesPerSecond(ProgressColumn):

@@ -5,7 +5,7 @@ Verification computes the manifest again from the rounds, and so finds damage in
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from datagen.recording.folder import (
     read_states,
     write_if_changed,
 )
+from datagen.recording.mcap.index import open_round
+from datagen.recording.names import SIDES
 from datagen.recording.splits import Split, split_path, write_split
 from datagen.recording.statistics import describe
 from runtime.files import file_hash
@@ -83,6 +85,21 @@ def manifest_problems(folder: Path) -> Iterator[str]:
         yield f"{', '.join(sorted(changed))} in {folder}: other content than {MANIFEST} was made of"
     else:
         yield f"{path} does not describe the rounds in the folder; {remedy}"
+
+
+def planned_split(folder: Path, side_of: Mapping[str, str], listed: Collection[str]) -> Split:
+    """Return the split of a plan, with only the rounds whose ids are in `listed`.
+
+    `side_of` contains the side of each planned round by id. Finished rounds in `folder` that were
+    recovered from damaged files are listed as recovered. Raises DatasetError for a damaged round.
+    """
+    ids = [round_id for round_id in side_of if round_id in listed]
+    states = read_states(folder)
+    finished = (open_round(folder / states[i].file, ()) for i in ids if i in states)
+    return Split(
+        **{side: tuple(i for i in ids if side_of[i] == side) for side in SIDES},
+        recovered=tuple(index.header.id for index in finished if index.recovery is not None),
+    )
 
 
 def rebuild(folder: Path, split: Split) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import trackfeatures as tf
+from datagen.execution.collect import initialise_folder
 from datagen.execution.lock import folder_lock
 from datagen.execution.merge import merge
 from datagen.planning.config import CollectConfig
@@ -21,7 +22,9 @@ from datagen.planning.tracks import choose_tracks
 from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
+from datagen.recording.integrity.recover import recover
 from datagen.recording.integrity.verify import verify
+from datagen.recording.splits import read_split, split_path
 from tests.datagen.commands import datagen_here, make_small_plan
 from trackfeatures.camera import CameraParameters
 
@@ -207,3 +210,44 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
     deadline = time.monotonic() + 120.0
     while datagen_here("collect", *ROUNDS, "--out", whole).returncode:  # the lock ended with it
         assert time.monotonic() < deadline
+
+
+def _with_recovered(whole: Path, folder: Path) -> tuple[Path, int]:
+    """A copy of the dataset in which round-001 was cut and recovered; and its number of frames."""
+    shutil.copytree(whole, folder)
+    file = folder / "rounds" / "round-001.mcap"
+    damaged = folder.parent / "cut.mcap"
+    damaged.write_bytes(file.read_bytes()[: file.stat().st_size * 3 // 4])
+    file.unlink()
+    saved = recover(damaged, file).saved
+    assert 0 < saved < 20
+    return folder, saved
+
+
+def test_a_recovered_round_stays_in_a_dataset_that_is_collected_again(
+    whole: Path, tmp_path: Path
+) -> None:
+    folder, saved = _with_recovered(whole, tmp_path / "data")
+    (folder / "rounds" / "round-002.mcap").unlink()
+    done = datagen_here("collect", *ROUNDS, "--out", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["frames"], result["recorded_frames"]) == (40 + saved, 20)
+    assert Dataset.open(folder).content_hash == result["content_hash"]
+    split = read_split(split_path(folder))
+    assert (split.recovered, split.side("round-001")) == (
+        ("round-001",),
+        read_split(split_path(whole)).side("round-001"),
+    )
+    assert verify(folder, "full").ok
+    assert f"{40 + saved}/{40 + saved} frames" in done.stderr
+    initialise_folder(folder, make_small_plan(3, 20))
+    assert Dataset.open(folder).rounds  # readers can also open it while rounds are recorded
+
+
+def test_a_recovered_round_is_merged(whole: Path, tmp_path: Path) -> None:
+    folder, saved = _with_recovered(whole, tmp_path / "data")
+    merged = merge([folder], tmp_path / "out")
+    assert (merged.rounds, merged.frames) == (3, 40 + saved)
+    assert read_split(split_path(tmp_path / "out")).recovered == ("round-001",)
+    assert verify(tmp_path / "out", "full").ok
