@@ -71,7 +71,7 @@ def make_course(kind: str, road: Road, length_m: float, rng: np.random.Generator
 
     Raises UserError for another kind.
     """
-    count = int(length_m) + 1
+    count = max(int(length_m) + 1, 2)  # a gradient needs two values
     if kind not in _MAKERS:
         raise tf.UserError(f"unknown trajectory {kind!r}; choose {', '.join(TRAJECTORIES)}")
     base, smoothing_m = _MAKERS[kind](road, count, rng)

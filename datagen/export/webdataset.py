@@ -23,6 +23,7 @@ from datagen.view.steps import Step, values
 SUFFIX = {"jpeg": "jpg", "png": "png"}
 SCHEMA_FILE = "sample.schema.json"
 SHUFFLE_SEED = 0
+TAR_FORMAT = tarfile.PAX_FORMAT  # equals USTAR except for file names of over 100 characters
 
 
 def write(
@@ -39,9 +40,8 @@ def write(
         samples = _samples(side, shuffle)
         for number, first in enumerate(range(0, side.frames, shard_size)):
             size = min(shard_size, side.frames - first)
-            with tarfile.open(
-                folder / f"{side.name}-{number:06d}.tar", "w", format=tarfile.USTAR_FORMAT
-            ) as shard:
+            path = folder / f"{side.name}-{number:06d}.tar"
+            with tarfile.open(path, "w", format=TAR_FORMAT) as shard:
                 for _, (info, step, codec) in zip(range(size), samples, strict=False):
                     _add_sample(shard, info, step, codec)
             done += size

@@ -27,6 +27,9 @@ MAX_ROUNDS = SEEDS_PER_PLAN // 2
 MAX_SEED = 10**12
 """Largest seed of a plan: the seeds of its rounds are below 2^63, the limit of random roads."""
 
+MAX_LAPS = 1000
+"""Largest number of laps of a drive, which is one file and is planned in memory."""
+
 
 def all_lights() -> tuple[str, ...]:
     """Return the names of all lighting conditions of the camera simulation."""
@@ -138,6 +141,10 @@ class CollectConfig:
         options = asdict(self, dict_factory=stored)
         return {k: v for k, v in options.items() if k not in LATER or v != LATER[k]}
 
+    def round_id(self, number: int) -> str:
+        """Return the name of round `number` (from 0): the prefix and the number."""
+        return f"{self.prefix}-{number:0{max(3, len(str(self.rounds - 1)))}d}"
+
     def __post_init__(self) -> None:
         self._check_numbers()
         self._check_choices()
@@ -191,6 +198,7 @@ class CollectConfig:
             if unknown := set(given) - set(known):
                 raise UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")
         require_name(self.prefix, "prefix of the rounds' names")
+        require_name(self.round_id(self.rounds - 1), "last round's name, --prefix and a number,")
         if self.split not in ("", UNSEEN):
             raise UserError(f"there is no split {self.split!r} to collect; give {UNSEEN} or none")
 
@@ -202,15 +210,20 @@ LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
 @dataclass(frozen=True)
 class ProtocolConfig:
     """Options of `datagen protocol`. By default 15 rounds of 2,000 images are recorded, as many
-    images as the paper has. The constructor raises UserError unless `laps` is positive."""
+    images as the paper has. The constructor raises UserError unless `laps` is above 0 and at
+    most 1000 (MAX_LAPS)."""
 
     rounds: Annotated[int, Option(help="Number of rounds on the nine tracks.")] = 15
     frames: Annotated[int, Option(help="Number of frames in each round on the nine tracks.")] = 2000
     laps: Annotated[
-        float, Option(help="Number of laps of each of the four drives on g-track-3 and dirt-3.")
+        float,
+        Option(
+            help="Number of laps of each of the four drives on g-track-3 and dirt-3, above 0 to "
+            "1000."
+        ),
     ] = 1.0
     seed: Seed = 1810
 
     def __post_init__(self) -> None:
-        if self.laps <= 0:
-            raise UserError(f"{self.laps:g} laps asked for; give more than 0, such as 1")
+        if not 0 < self.laps <= MAX_LAPS:
+            raise UserError(f"{self.laps:g} laps asked for; give above 0 to {MAX_LAPS}, such as 1")

@@ -50,10 +50,9 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
         splits = ["test" if number in test else "train" for number in range(count)]
     cameras = _cameras(config, rng)
     roads = _roads(config, lanes, lights)
-    digits = max(3, len(str(count - 1)))
     rounds = tuple(
         RoundPlan(
-            id=f"{config.prefix}-{number:0{digits}d}",
+            id=config.round_id(number),
             seed=_first_seed(config) + number,
             split=splits[number],
             track=tracks[number].name,

@@ -98,6 +98,21 @@ def test_names_that_differ_in_a_dot_have_different_keys(samples: Samples, tmp_pa
     assert len(set(keys)) == len(keys) == 3 * FRAMES
 
 
+def test_rounds_with_long_names_are_exported(samples: Samples, tmp_path: Path) -> None:
+    prepare(tmp_path / "data")
+    names = ("r" * 128, "." * 127 + "r", "r" * 88, "r" * 87)
+    for number, name in enumerate(names):
+        header = replace(samples.header(f"r{number:03d}"), id=name)
+        samples.add_round(tmp_path / "data", header)
+    rebuild(tmp_path / "data", Split(train=names, test=()))
+    export(tmp_path / "data", tmp_path / "out", "--format", "lerobot")
+    export(tmp_path / "data", tmp_path / "shards")
+    found = read_shards(*(tmp_path / "shards").glob("*.tar"))
+    keys = {f"{name.replace('.', '%2E')}-{i:06d}" for name in names for i in range(FRAMES)}
+    assert {s["__key__"] for s in found} == keys
+    assert len(found) == len(keys)
+
+
 def test_the_same_dataset_gives_the_same_bytes_and_shuffling_the_same_order(
     dataset: Path, tmp_path: Path
 ) -> None:

@@ -39,6 +39,14 @@ def test_equal_configs_give_equal_plans_and_other_configs_other_plans() -> None:
     assert len(hashes) == 7
 
 
+def test_a_prefix_leaves_room_for_the_number_of_the_last_round() -> None:
+    rounds = make_plan(wanted(prefix="p" * 124, rounds=2)).rounds
+    assert rounds[-1].id == "p" * 124 + "-001"
+    for prefix, count in (("p" * 125, 2), ("p" * 124, 1001)):
+        with pytest.raises(UserError, match=r"last round's name.*'p+'; .*128 characters"):
+            wanted(prefix=prefix, rounds=count)
+
+
 def test_sixty_rounds_cover_everything_evenly() -> None:
     rounds = make_plan(wanted()).rounds
     tracks = Counter(entry.track for entry in rounds)

@@ -55,8 +55,19 @@ def test_a_drive_takes_as_long_as_its_lap(monkeypatch: pytest.MonkeyPatch) -> No
     assert {entry.track for entry in plan.rounds[:4]} == {"oval", "town"}
     assert len({entry.seed for entry in plan.rounds}) == len(plan.rounds)
     assert plan.hash == protocol_plan(ProtocolConfig(rounds=4, frames=50, laps=0.5), None).hash
-    with pytest.raises(UserError, match="0 laps asked for"):
-        ProtocolConfig(laps=0)
+
+
+@pytest.mark.parametrize("laps", [0.0, -1.0, 1001.0, np.inf, np.nan])
+def test_impossible_numbers_of_laps_are_refused(laps: float) -> None:
+    with pytest.raises(UserError, match=rf"{laps:g} laps asked for; give above 0 to 1000"):
+        ProtocolConfig(laps=laps)
+
+
+def test_a_drive_of_less_than_a_metre_has_a_frame() -> None:
+    assert protocol.drive_frames(find_track("oval"), 1e-4, 20) == 1
+    for kind in (MIDDLE, *TRAJECTORIES):
+        road = Road(find_track("highway"), 1)
+        assert len(make_course(kind, road, 0.3, np.random.default_rng(0)).offset) == 2
 
 
 def test_a_drive_is_one_whole_lap() -> None:
