@@ -123,7 +123,10 @@ class Contents:
 
     @cached_property
     def scene(self) -> dict[str, Points]:
-        """Markings and edges of the track by name; each is (N, 3) in m in the world frame."""
+        """Markings and edges of the track by name; each is (N, 3) in m in the world frame. {} if a
+        recovered round has lost them."""
+        if not len(self.steps.index.messages[TRACK_SCENE]):
+            return {}
         return {
             entity.id: np.array([(p.x, p.y, p.z) for line in entity.lines for p in line.points])
             for entity in self.steps.message(TRACK_SCENE, 0).entities

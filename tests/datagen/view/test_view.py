@@ -21,12 +21,14 @@ from typer.testing import CliRunner
 
 from datagen.cli import app
 from datagen.recording.dataset import Dataset
+from datagen.recording.integrity.recover import recover
+from datagen.recording.mcap.footer import read_summary
 from datagen.recording.schema.messages import CAMERA_FRAME, EGO
 from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.view import rerun as rerun_log
 from datagen.view.contents import Contents
 from datagen.view.html_page import page
-from tests.datagen.conftest import FRAMES
+from tests.datagen.conftest import FRAMES, Samples
 
 Refused = Callable[..., str]
 
@@ -67,6 +69,23 @@ def test_the_contents_are_what_was_recorded(recorded: Path, dataset: Path) -> No
     assert "a-track, 2 lanes, 2 other cars, clear, weave, 60 km/h; 45 frames, 2.25 s" in (
         contents.about
     )
+
+
+def test_a_recovered_round_without_the_lines_of_the_track_is_shown(
+    samples: Samples, tmp_path: Path
+) -> None:
+    """They are in the first chunk only."""
+    whole, out = tmp_path / "r001.mcap", tmp_path / "out.mcap"
+    samples.write(whole, samples.header("r001"), samples.frames(60, seed=1))
+    data = bytearray(whole.read_bytes())
+    data[read_summary(memoryview(data)).chunks[0].start + 1000] ^= 1
+    whole.write_bytes(data)
+    saved = recover(whole, out).saved
+    assert Contents.open(out).scene == {}
+    page_file, rerun_file = tmp_path / "round.html", tmp_path / "round.rrd"
+    assert json.loads(view(out, "--html", page_file, "--json"))["frames"] == saved
+    assert read_page(page_file.read_text())["lines"] == []
+    assert json.loads(view(out, "--save", rerun_file, "--json"))["frames"] == saved
 
 
 def test_the_page_holds_images_markings_and_series_in_step(
