@@ -128,13 +128,16 @@ class Frames:
 
         Returns them as (B, H, W, 3) uint8 RGB: in `out`, or in a new array. Raises IndexError for a
         frame that does not exist, UndecodableImage for a damaged image (the rest of `out` is then
-        undefined), and ValueError if `out` has another shape or type.
+        undefined), and ValueError if `out` has another shape or type, is read-only, or has images
+        that are not C-contiguous.
         """
         numbers = np.asarray(indices, dtype=np.int64)
         shape = (len(numbers), self.camera.height, self.camera.width, 3)
         out = np.empty(shape, np.uint8) if out is None else out
         if out.shape != shape or out.dtype != np.uint8:
             raise ValueError(f"`out` is {out.dtype} {out.shape}, expected uint8 {shape}")
+        if not out.flags.writeable or not all(image.flags.c_contiguous for image in out[:1]):
+            raise ValueError("`out` is read-only or has gaps within an image; give another array")
         absent = numbers[(numbers < 0) | (numbers >= len(self))]
         if len(absent):
             raise IndexError(f"frame {absent[0]} of {len(self)}")

@@ -141,6 +141,12 @@ def test_a_batch_of_another_shape_is_refused(dataset: Path) -> None:
     frames = Dataset.open(dataset).select("all")
     with pytest.raises(ValueError, match=r"expected uint8 \(2, 42, 56, 3\)"):
         frames.read_batch([0, 1], np.empty((2, 56, 42, 3), np.uint8))
+    fixed = np.empty((2, 42, 56, 3), np.uint8)
+    fixed.flags.writeable = False
+    for out in (fixed, np.empty((2, 42, 112, 3), np.uint8)[:, :, ::2], fixed[..., ::-1]):
+        with pytest.raises(ValueError, match="`out` is read-only or has gaps within an image"):
+            frames.read_batch([0, 1], out)
+    assert frames.read_batch([], np.empty((0, 42, 56, 3), np.uint8)).shape == (0, 42, 56, 3)
     with pytest.raises(IndexError):
         frames.jpeg(135)
 
