@@ -30,6 +30,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.claims.outcome import conclude, run_command
+from runtime.files import unfinished_path
 
 TRACKS = "oval,circuit"
 WARM_UP = ("--rounds", "2", "--frames", "2")
@@ -146,7 +147,7 @@ def phase(out: Path) -> str:
     partial = [file.stat().st_size for file in out.glob(".partial/*/round.mcap")]
     if any(not (out / f"state/{r.stem}.json").is_file() for r in out.glob("rounds/*.mcap")):
         return "renaming"
-    if any(out.rglob(".*.new")):
+    if any(out.rglob(unfinished_path(Path("?*")).name)):
         return "writing a small file"
     if any(partial):
         return "recording or checking"
