@@ -44,8 +44,9 @@ MAX_RESETS = 20
 # no image, and simulation is twice as fast without rendering in between.
 BATCH_FRAMES = 20
 CACHED_SCENES = BATCH_FRAMES  # scenes that the camera keeps, so that a batch builds no scene twice
-# Difference between the seeds of two consecutive scenes of a round. It is larger than any seed of
-# a round, so scenes of different rounds never share a seed.
+# Difference between the seeds of two consecutive scenes of a round. The seeds of the rounds of one
+# plan differ by less, so scenes of different rounds of a plan never share a seed. Scenes of two
+# plans can share one only if the seeds of the plans differ by more than a million.
 SCENERY_SEED_STRIDE = 2**40
 
 
