@@ -48,9 +48,12 @@ class ProcessPool:
         track). All processes have ended when this method returns or raises.
         """
         self._queue = RetryQueue(jobs, self._timeouts, self._on_message)
+        count = min(self._size, len(self._queue))
+        if not count:
+            return []
         try:
-            with _single_threaded(self._size):
-                for _ in range(min(self._size, len(self._queue))):
+            with _limited_threads(count):
+                for _ in range(count):
                     self._workers.append(self._start_worker())
                 while self._assign():
                     self._receive()
@@ -157,7 +160,7 @@ def _code(process: BaseProcess) -> int | None:
 
 
 @contextmanager
-def _single_threaded(workers: int) -> Iterator[None]:
+def _limited_threads(workers: int) -> Iterator[None]:
     """Set the environment variables of `thread_limits` for `workers` processes within the block.
     Libraries in the child processes read them when they are loaded."""
     limits = thread_limits(workers)

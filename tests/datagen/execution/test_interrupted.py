@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from datagen.errors import RoundFailed
+from datagen.execution import process_pool
 from datagen.execution.collect import collect
 from datagen.execution.process_pool import ProcessPool
 from datagen.execution.retry import ATTEMPTS, DEATHS_IN_A_ROW, RetryQueue, Timeouts
@@ -187,6 +188,23 @@ def test_a_round_that_takes_too_long_is_tried_three_times_and_given_up(tmp_path:
     assert "did not finish the round in 1 s" in failure.reason
     assert not failure.final
     assert len(started) == ATTEMPTS
+
+
+def test_the_share_of_the_cores_is_that_of_the_started_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limited: list[int] = []
+
+    def limits(workers: int) -> dict[str, str]:
+        limited.append(workers)
+        raise OSError(f"{workers} processes")
+
+    monkeypatch.setattr(process_pool, "thread_limits", limits)
+    for rounds in (1, 3):
+        with pytest.raises(OSError, match="processes"):
+            ProcessPool(2, lambda message: None).run(make_jobs(tmp_path, rounds, frames=10))
+    assert limited == [1, 2]
+    assert ProcessPool(2, lambda message: None).run([]) == []
 
 
 def test_retries_have_growing_delays_and_end_after_the_third_attempt(tmp_path: Path) -> None:
