@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from time import monotonic
@@ -54,7 +55,8 @@ class ProcessPool:
         try:
             with _limited_threads(count):
                 for _ in range(count):
-                    self._workers.append(self._start_worker())
+                    with _interrupt_afterwards():
+                        self._workers.append(self._start_worker())
                 while self._assign():
                     self._receive()
                     self._kill_hung_workers()
@@ -65,12 +67,7 @@ class ProcessPool:
     def _start_worker(self) -> Worker:
         mine, theirs = CONTEXT.Pipe()
         process = CONTEXT.Process(target=worker_main, args=(theirs, os.getpid()), daemon=True)
-        # Child processes inherit ignored signals: only this process handles Ctrl-C.
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            process.start()
-        finally:
-            signal.signal(signal.SIGINT, before)
+        process.start()
         theirs.close()
         return Worker(process, mine)
 
@@ -131,7 +128,8 @@ class ProcessPool:
         ended.connection.close()
         ended.process.join()
         self._queue.record_death(ended.job, reason)
-        self._workers[number] = self._start_worker()
+        with _interrupt_afterwards():
+            self._workers[number] = self._start_worker()
 
     def _stop_workers(self) -> None:
         """Ask idle workers to end, and kill busy ones."""
@@ -157,6 +155,24 @@ class ProcessPool:
 def _code(process: BaseProcess) -> int | None:
     process.join(STOP_S)
     return process.exitcode
+
+
+@contextmanager
+def _interrupt_afterwards() -> Iterator[None]:
+    """Delay SIGINT (Ctrl-C) until the block has ended. Processes that are started in the block
+    inherit the blocked signal: only this process handles Ctrl-C."""
+    resource_tracker.ensure_running()  # its start would unblock the signal within the block
+    arrived: list[int] = []
+    # Another thread can receive the signal; then the handler runs although the signal is blocked.
+    before = signal.signal(signal.SIGINT, lambda number, frame: arrived.append(number))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        signal.signal(signal.SIGINT, before)
+        if arrived:
+            signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

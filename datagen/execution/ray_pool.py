@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from os import cpu_count
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
@@ -157,7 +157,10 @@ class RayPool:
 
     def _receive(self) -> None:
         results = [slot.result for slot in self._slots if slot.job is not None]
-        ready, _ = self._ray.wait(results, timeout=POLL_S) if results else ([], [])
+        if not results:  # all remaining rounds wait for their next attempt
+            sleep(min(max(self._queue.next_at() - monotonic(), 0.0), POLL_S))
+            return
+        ready, _ = self._ray.wait(results, timeout=POLL_S)
         for slot in self._slots:
             if slot.job is None or slot.result not in ready:
                 continue

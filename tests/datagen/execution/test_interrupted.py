@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -205,6 +206,25 @@ def test_the_share_of_the_cores_is_that_of_the_started_processes(
             ProcessPool(2, lambda message: None).run(make_jobs(tmp_path, rounds, frames=10))
     assert limited == [1, 2]
     assert ProcessPool(2, lambda message: None).run([]) == []
+
+
+def test_an_interrupt_at_the_start_of_a_process_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, started = BaseProcess.start, []
+
+    def interrupted_start(process: BaseProcess) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        start(process)
+        started.append(process)
+
+    monkeypatch.setattr(BaseProcess, "start", interrupted_start)
+    pool = ProcessPool(2, lambda message: None)
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(make_jobs(tmp_path, rounds=2, frames=10))
+    assert [process.exitcode is not None for process in started] == [True]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def test_retries_have_growing_delays_and_end_after_the_third_attempt(tmp_path: Path) -> None:

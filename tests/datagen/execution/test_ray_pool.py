@@ -3,10 +3,12 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import pytest
 
+from datagen.execution import ray_pool
 from datagen.execution.ray_pool import RayPool
 from datagen.execution.retry import Timeouts
 from datagen.recorder.job import FramesDone, RoundDone
@@ -73,6 +75,23 @@ def test_only_a_cluster_that_is_named_is_joined(
         RayPool(1, lambda message: None).run(make_jobs(tmp_path, rounds=1, frames=10))
     assert [options["address"] for options in asked] == [address or "local"]
     assert all("num_cpus" not in options for options in asked if address)
+
+
+def test_the_pool_sleeps_until_a_retry_is_due(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(ray_pool, "_import_ray", lambda: None)
+    monkeypatch.setattr(ray_pool, "sleep", slept.append, raising=False)
+    pool = RayPool(1, lambda message: None, Timeouts(retry_delay_s=0.2))
+    (job,) = make_jobs(tmp_path, rounds=1, frames=10)
+    pool._queue.record_failure(job, "its actor ended", monotonic())
+    pool._receive()
+    assert 0.0 < slept[0] <= 0.2
+    pool._queue.record_failure(job, "its actor ended", monotonic() + 60.0)
+    assert pool._queue.take(monotonic() + 1.0) == job
+    pool._receive()
+    assert slept[1:] == [0.5]
 
 
 @pytest.mark.extended
