@@ -15,14 +15,13 @@ from typing import Any, Self
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from mtlnet.predict.lenses import with_lens
-from mtlnet.predict.writers import Writer, open_writer, require_different
+from mtlnet.predict.writers import Writer, open_writer, require_different, require_inputs_kept
 from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
 from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
 from mtlnet.sources.read import READ_AHEAD, SourceImage, read_sources
 from mtlnet.sources.streams import Stream
 from runtime.cli import counted
-from runtime.files import require_other_file
 from trackfeatures.errors import UserError
 
 KEPT_ROWS = 10_000
@@ -62,15 +61,14 @@ def predict_files(
 
     Raises InputsLeftOut, after all other images are done, when an input or an image could not be
     used; UserError at once for an invalid `lens`, and for outputs that cannot be written, are
-    the same file or are among the files to read.
+    the same file, are among the files to read or could replace one of them.
     """
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
     camera = engine.card.camera
     sources = find_sources(list(inputs), note, topic)
     usable = [source for source in sources if not source.problem]
-    for path in outputs:
-        require_other_file(path, [file for source in usable for file in source.files])
+    require_inputs_kept(outputs, (file for source in sources for file in source.files))
     require_different(outputs)
     for source in sources:
         if source.problem and len(sources) > 1:  # the problem of a single source is the error

@@ -8,7 +8,7 @@ Names that are not UTF-8 are written in tables as described in `runtime.files`.
 import csv
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -31,6 +31,8 @@ TABLE_SUFFIXES = (".csv", ".jsonl")
 TEXT_HEIGHT = 64
 """Height of the text with the features below a picture, px."""
 TEXT_COLOUR = (235, 235, 235)
+PICTURE_NAMES = "[0-9][0-9][0-9][0-9]*-*.png"
+"""Pattern that matches all file names of `PictureWriter`."""
 MAX_STEM_BYTES = 200
 """Maximum length, bytes, of an image's name within the file name of its picture; a file name has at
 most 255."""
@@ -67,6 +69,30 @@ def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
 
         return McapWriter(path, camera, fps)
     return FilmWriter(path, camera, fps) if kind == FILM_SUFFIX else PictureWriter(path, camera)
+
+
+def require_inputs_kept(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
+    """Raise UserError if one of `outputs` is one of the files `inputs`, also by another name or
+    link, or is a folder in which one of `inputs` has a name like those of `PictureWriter`."""
+    places = {_place(path) for path in inputs} - {None}
+    for output in outputs:
+        if _place(output) in places:
+            raise UserError(f"--out {output} is a file to read; give another one")
+        for path in output.glob(PICTURE_NAMES):
+            if _place(path) in places:
+                raise UserError(
+                    f"--out {output}: {path} is a file to read, which a drawn picture could "
+                    "replace; give another folder"
+                )
+
+
+def _place(path: Path) -> tuple[int, int] | None:
+    """Device and inode of the file at `path`; None where there is no file."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
 
 
 def require_different(outputs: Sequence[Path]) -> None:

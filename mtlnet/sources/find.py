@@ -51,7 +51,8 @@ class Source:
     @property
     def files(self) -> list[Path]:
         """The files from which the images are read, and which must not be written to."""
-        return list(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        is_bag = self.kind is SourceKind.RECORDING and self.path.is_dir()
+        return list(self.path.iterdir()) if is_bag else [self.path]
 
 
 def find_sources(

@@ -178,3 +178,37 @@ def test_a_file_to_read_is_not_overwritten(tmp_path: Path, engine: BrightnessEng
         with pytest.raises(UserError, match=r"film.mp4 is a file to read; give another one"):
             predict_files(engine, [str(film)], [out])
     assert film.read_bytes() == before
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_picture_to_read_is_not_replaced_by_a_drawn_one(
+    tmp_path: Path, engine: BrightnessEngine, link: bool
+) -> None:
+    first = write_jpeg(tmp_path / "b.png", 10)
+    second = write_jpeg(tmp_path / ("c.png" if link else "0000-b.png"), 200)
+    if link:
+        (tmp_path / "0000-b.png").symlink_to(second)
+    before = second.read_bytes()
+    with pytest.raises(UserError, match=r"0000-b\.png is a file to read, .* give another folder"):
+        predict_files(engine, [str(first), str(second)], [tmp_path])
+    assert second.read_bytes() == before
+    assert engine.seen == []
+
+
+def test_pictures_are_drawn_into_the_folder_of_their_images(
+    tmp_path: Path, engine: BrightnessEngine
+) -> None:
+    image = write_jpeg(tmp_path / "a.jpg", 10)
+    before = image.read_bytes()
+    predict_files(engine, [str(image)], [tmp_path])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000-a.png", "a.jpg"]
+    assert image.read_bytes() == before
+
+
+def test_a_damaged_input_is_not_overwritten(tmp_path: Path, engine: BrightnessEngine) -> None:
+    film = tmp_path / "cut.mp4"
+    film.write_bytes(b"\0\0\0\x18ftypmp42")
+    image = write_jpeg(tmp_path / "a.jpg", 10)
+    with pytest.raises(UserError, match=r"cut\.mp4 is a file to read"):
+        predict_files(engine, [str(film), str(image)], [film])
+    assert film.read_bytes() == b"\0\0\0\x18ftypmp42"
