@@ -8,14 +8,20 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Self
 
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from mtlnet.predict.lenses import with_lens
-from mtlnet.predict.writers import Writer, open_writer, require_different, require_inputs_kept
+from mtlnet.predict.writers import (
+    Writer,
+    check_output,
+    open_writer,
+    require_different,
+    require_inputs_kept,
+)
 from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
 from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
@@ -51,13 +57,14 @@ def predict_files(
     """Predict the features of all images that `inputs` name (`mtlnet.sources.find.find_sources`).
 
     Returns the results of the first 10,000 images, a dict for each; all results are written to each
-    of `outputs` (`mtlnet.predict.writers.open_writer`), image by image. `lens`: the lens of all
-    sources except recorded rounds, which must be of the model's camera; None: the lens that a
-    recording states or that is estimated, else the model's. `report`: called with the numbers of
-    images done and in total. `note`: called with a line about files that are left out and cameras
-    that are found. `topic`: the topic to read from recordings; empty: the only topic with pictures.
-    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends a stream
-    normally.
+    of `outputs` (`mtlnet.predict.writers.open_writer`), image by image. The outputs are opened when
+    the first image has been answered; earlier files are kept if no image can be used. `lens`: the
+    lens of all sources except recorded rounds, which must be of the model's camera; None: the lens
+    that a recording states or that is estimated, else the model's. `report`: called with the
+    numbers of images done and in total. `note`: called with a line about files that are left out
+    and cameras that are found. `topic`: the topic to read from recordings; empty: the only topic
+    with pictures. `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C
+    ends a stream normally.
 
     Raises InputsLeftOut, after all other images are done, when an input or an image could not be
     used; UserError at once for an invalid `lens`, and for outputs that cannot be written, are
@@ -66,23 +73,27 @@ def predict_files(
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
     camera = engine.card.camera
+    for path in outputs:
+        check_output(path)
+    require_different(outputs)
     sources = find_sources(list(inputs), note, topic)
     usable = [source for source in sources if not source.problem]
     require_inputs_kept(outputs, (file for source in sources for file in source.files))
-    require_different(outputs)
     for source in sources:
         if source.problem and len(sources) > 1:  # the problem of a single source is the error
             note(source.problem)
-    if not usable:
-        outputs = ()  # files that an earlier command wrote are kept
     sources = [with_lens(source, camera, lens, note, calibrate=calibrate) for source in sources]
     answers = _Answers(engine, sum(source.count for source in sources), report)
-    with ExitStack() as stack:
-        fps = usable[0].fps if usable else DEFAULT_FPS
-        writers = [stack.enter_context(open_writer(path, camera, fps)) for path in outputs]
-        writing = stack.enter_context(_Writing(writers))
-        items = read_sources(sources, camera)
-        stack.callback(items.close)
+    fps = usable[0].fps if usable else DEFAULT_FPS
+
+    def open_files() -> list[Writer]:
+        return [files.enter_context(open_writer(path, camera, fps)) for path in outputs]
+
+    with (
+        ExitStack() as files,
+        _Writing(open_files) as writing,
+        closing(read_sources(sources, camera)) as items,
+    ):
         try:
             for item in items:
                 answers.add(item, writing)
@@ -148,18 +159,22 @@ class _Answers:
 class _Writing:
     """Writes answers in order on its own thread.
 
-    The next `write`, or the end of the context, raises an error that occurred in this thread;
-    nothing is written after the error.
+    The first `write` opens the writers, so that files of an earlier command are kept if no image
+    can be used. The next `write`, or the end of the context, raises an error that occurred in this
+    thread; nothing is written after the error.
     """
 
-    def __init__(self, writers: list[Writer]) -> None:
-        self._writers = writers
+    def __init__(self, open_writers: Callable[[], list[Writer]]) -> None:
+        self._open_writers = open_writers
+        self._writers: list[Writer] | None = None
         self._thread = ThreadPoolExecutor(1)
         self._waiting: deque[Future[None]] = deque()
         self._failed = False
 
     def write(self, item: SourceImage, prediction: Prediction) -> None:
         """Queue one answer for writing; waits while more than `READ_AHEAD` answers are queued."""
+        if self._writers is None:
+            self._writers = self._open_writers()
         if self._writers:
             self._waiting.append(self._thread.submit(self._write, item, prediction))
         while self._waiting and (len(self._waiting) > READ_AHEAD or self._waiting[0].done()):
@@ -169,7 +184,7 @@ class _Writing:
         if self._failed:
             return
         try:
-            for writer in self._writers:
+            for writer in self._writers or ():
                 writer.write(item, prediction)
         except BaseException:
             self._failed = True

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from stat import S_ISDIR
 from typing import Any, Protocol, Self
 
 import cv2
@@ -49,19 +50,29 @@ class Writer(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
-def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
-    """Open the writer for the suffix of `path`; a path without a suffix is a folder of pictures.
-
-    `camera`: the model's camera, in whose view pictures are drawn. `fps`: frames per second of a
-    film or recording. Raises UserError for an unknown suffix, or a parent folder that does not
-    exist.
-    """
+def check_output(path: Path) -> None:
+    """Raise UserError if `open_writer` cannot write to `path`: for an unknown suffix, a parent
+    folder that does not exist, a folder instead of a file, or a file instead of a folder."""
     kind = path.suffix.lower()
     if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX, ""):
         kinds = ", ".join((*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX))
         raise UserError(f"--out {path}: give a file ending in {kinds}, or a folder for pictures")
     if not path.parent.is_dir():
         raise UserError(f"--out {path}: there is no folder {path.parent}; make it first")
+    if kind and path.is_dir():
+        raise UserError(f"--out {path} is a folder; give the name of a file in it")
+    if not kind and path.exists() and not path.is_dir():
+        raise UserError(f"--out {path} is a file; give a folder for pictures")
+
+
+def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
+    """Open the writer for the suffix of `path`, which empties a file that exists; a path without a
+    suffix is a folder of pictures. Call `check_output` first.
+
+    `camera`: the model's camera, in whose view pictures are drawn. `fps`: frames per second of a
+    film or recording. Raises OSError if the file cannot be opened.
+    """
+    kind = path.suffix.lower()
     if kind in TABLE_SUFFIXES:
         return TableWriter(path)
     if kind == MCAP_SUFFIX:
@@ -87,12 +98,12 @@ def require_inputs_kept(outputs: Sequence[Path], inputs: Iterable[Path]) -> None
 
 
 def _place(path: Path) -> tuple[int, int] | None:
-    """Device and inode of the file at `path`; None where there is no file."""
+    """Device and inode of the file at `path`; None for a folder, or where there is nothing."""
     try:
         found = path.stat()
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return None if S_ISDIR(found.st_mode) else (found.st_dev, found.st_ino)
 
 
 def require_different(outputs: Sequence[Path]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mtlnet.predict.run import predict_files
+from mtlnet.predict.run import InputsLeftOut, predict_files
 from tests.mtlnet.conftest import write_dataset, write_round
 from tests.mtlnet.predict.brightness_engine import BrightnessEngine, write_jpeg
 from trackfeatures.camera import CameraParameters
@@ -57,3 +57,38 @@ def test_a_damaged_chunk_of_a_round_costs_its_frames_only(
         predict_files(engine, [str(bad), str(good)], [table])
     rows = [json.loads(line) for line in table.read_text().splitlines()]
     assert [row["image"] for row in rows] == [f"{good}#{n}" for n in range(24)]
+
+
+def test_without_a_usable_image_earlier_files_are_kept(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    image = tmp_path / "a.png"
+    image.write_bytes(b"no picture")
+    outputs = [tmp_path / f"old{suffix}" for suffix in (".csv", ".jsonl", ".mp4", ".mcap")]
+    for path in outputs:
+        path.write_text("yesterday")
+    with pytest.raises(InputsLeftOut, match=r"a\.png"):
+        predict_files(engine, [str(image)], [*outputs, tmp_path / "drawn"])
+    assert [path.read_bytes() for path in outputs] == [b"yesterday"] * len(outputs)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.png", *(p.name for p in outputs)}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("rows.txt", r"give a file ending in \.csv"),
+        ("none/rows.csv", "there is no folder"),
+        ("folder.csv", "is a folder"),
+        ("a.png/drawn", "there is no folder"),
+        ("file", "is a file; give a folder for pictures"),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_refused_before_the_first_image(
+    engine: BrightnessEngine, tmp_path: Path, name: str, message: str
+) -> None:
+    image = write_jpeg(tmp_path / "a.png", 10)
+    (tmp_path / "folder.csv").mkdir()
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(UserError, match=message):
+        predict_files(engine, [str(image)], [tmp_path / name])
+    assert engine.seen == []

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 import trackfeatures as tf
-from mtlnet.predict.run import predict_files
+from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.predict.writers import TEXT_HEIGHT
 from mtlnet.sources.films import read_film_header
 from mtlnet.sources.find import find_sources
@@ -202,6 +202,11 @@ def test_pictures_are_drawn_into_the_folder_of_their_images(
     before = image.read_bytes()
     predict_files(engine, [str(image)], [tmp_path])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0000-a.png", "a.jpg"]
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(InputsLeftOut, match="there is no image in"):
+        predict_files(engine, [str(empty), str(image)], [empty])
+    assert [path.name for path in empty.iterdir()] == ["0000-a.png"]
     assert image.read_bytes() == before
 
 
