@@ -15,13 +15,7 @@ from typing import Any, Self
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from mtlnet.predict.lenses import with_lens
-from mtlnet.predict.writers import (
-    Writer,
-    check_output,
-    open_writer,
-    require_different,
-    require_inputs_kept,
-)
+from mtlnet.predict.writers import Writer, check_outputs, open_writer, require_inputs_kept
 from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
 from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
@@ -73,9 +67,7 @@ def predict_files(
     if isinstance(lens, float | int) and not 0 < lens < 180:  # NaN too
         raise UserError(f"--fov-y-deg {lens:g}: a field of view is above 0 and below 180 degrees")
     camera = engine.card.camera
-    for path in outputs:
-        check_output(path)
-    require_different(outputs)
+    check_outputs(outputs)
     sources = find_sources(list(inputs), note, topic)
     usable = [source for source in sources if not source.problem]
     require_inputs_kept(outputs, (file for source in sources for file in source.files))

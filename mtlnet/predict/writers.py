@@ -67,7 +67,7 @@ def check_output(path: Path) -> None:
 
 def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
     """Open the writer for the suffix of `path`, which empties a file that exists; a path without a
-    suffix is a folder of pictures. Call `check_output` first.
+    suffix is a folder of pictures. Call `check_outputs` first.
 
     `camera`: the model's camera, in whose view pictures are drawn. `fps`: frames per second of a
     film or recording. Raises OSError if the file cannot be opened.
@@ -106,10 +106,12 @@ def _place(path: Path) -> tuple[int, int] | None:
     return None if S_ISDIR(found.st_mode) else (found.st_dev, found.st_ino)
 
 
-def require_different(outputs: Sequence[Path]) -> None:
-    """Raise UserError if two of `outputs` are the same file or folder, also by other names."""
+def check_outputs(outputs: Sequence[Path]) -> None:
+    """Raise UserError if `open_writer` cannot write to one of `outputs` (`check_output`), or if two
+    of them are the same file or folder, also by other names."""
     places = [path.resolve() for path in outputs]
     for number, path in enumerate(outputs):
+        check_output(path)
         if places[number] in places[:number]:
             raise UserError(f"--out {path} is given twice; give each file once")
 

@@ -71,7 +71,6 @@ class Trainer:
             self.task_weighting.parameters,
             capturable=device.type == "cuda",
         )
-        self.target_variance: Tensor | None = None
         self.cuda_graph = self._cuda_graph()
         self.seed_dropout()
 
@@ -108,7 +107,12 @@ class Trainer:
         std = std.clamp_min(torch.tensor(least, dtype=std.dtype))
         self.network.target_mean.copy_(mean)
         self.network.target_std.copy_(std)
-        self.target_variance = (std**2).float().to(self.device)
+
+    @property
+    def target_variance(self) -> Tensor | None:
+        """The unit (6,) of the squared errors in the loss, the squared `target_std` of the network;
+        None if the recipe does not standardise."""
+        return self.network.target_std.square() if self.recipe.standardise else None
 
     def step(self, batch: Batch | DeviceBatch, progress: float) -> Losses:
         """Train on one batch; returns its losses before the weights changed.

@@ -60,7 +60,7 @@ def build(
     if capturable:
         extra = trainer.task_weighting.parameters
         trainer.optimizers = OptimizerSet(trainer.network, trainer.recipe, extra, capturable=True)
-    trainer.target_variance = torch.full((6,), 0.04, device=device)
+    trainer.network.target_std.fill_(0.2)
     trainer.step_number = MIN_STEPS_BEFORE_BN_FREEZE
     return trainer
 
