@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -131,6 +132,8 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
     given = dict(given)
     if heads := given.pop("heads", None):
         given["network"] = with_heads(given.get("network", stored.network), heads)
+    if stored.init and _is_run(given.get("init", stored.init), stored.init):
+        given["init"] = stored.init
     free: tuple[str, ...] = RESUMABLE_WITH
     if given.get("change_data"):
         free += ABOUT_DATA
@@ -144,6 +147,13 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
                 "resume, or start a new run with another --out"
             )
     return replace(stored, **{k: v for k, v in given.items() if k in free}), data
+
+
+def _is_run(name: str | Path, folder: str) -> bool:
+    """Whether `name` names the model in `folder`, which need not exist any more."""
+    with suppress(ModelError):
+        name = resolve_run(name)
+    return Path(name).resolve() == Path(folder).resolve()
 
 
 def newest_run() -> Path:

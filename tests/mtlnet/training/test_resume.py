@@ -21,8 +21,10 @@ from mtlnet.inference.curves import read_curves
 from mtlnet.inference.model_card import WEIGHTS, ModelError, read_card
 from mtlnet.train import train
 from mtlnet.training.checkpoint import list_checkpoints
-from mtlnet.training.configure import resume_config
+from mtlnet.training.configure import new_config, resume_config
 from mtlnet.training.loop import Stopped
+from mtlnet.training.recipes import find_recipe
+from mtlnet.training.run import create_run
 from runtime.files import locked_folder
 from tests.mtlnet.conftest import training_config, write_dataset
 from trackfeatures.errors import UserError
@@ -206,3 +208,27 @@ def test_a_run_is_resumed_though_its_model_has_been_replaced(dataset: Path, tmp_
         checkpoint.unlink()
     with pytest.raises(ModelError, match=r"has no checkpoint, and the model .* is not the one"):
         train(*resume_config(run.out, {"iterations": 3}))
+
+
+def test_a_run_is_resumed_with_the_model_named_as_at_its_start(
+    published: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs").mkdir()
+    shutil.copytree(published, "runs/mine")
+    Path("link").symlink_to("runs/mine")
+    for init, others in (
+        ("default", ["default"]),
+        ("mine", ["runs/mine", "./runs/mine", "link", str(tmp_path / "runs/mine")]),
+    ):
+        given = {"init": init, "data": dataset, "batch": 4, "device": "cpu"}
+        config = new_config(given, tmp_path / f"from-{init}")
+        create_run(config, find_recipe(config.recipe), {})
+        for name in (init, *others):
+            assert resume_config(config.out, {**given, "init": name})[0] == config
+        with pytest.raises(UserError, match=r"was started with init .*, now varied is given"):
+            resume_config(config.out, {"init": "varied"})
+    shutil.rmtree("runs/mine")
+    assert resume_config(config.out, {"init": "runs/mine"})[0] == config
+    with pytest.raises(UserError, match="now none is given"):
+        resume_config(config.out, {"init": "none"})
