@@ -81,8 +81,8 @@ class TaskWeighting:
         """For the method `dwa`, add the loss `terms` (3,) of a step, averaged over the whole batch,
         to the sums of the current window; for all other methods do nothing.
 
-        When the window has `window` steps, a new window begins. New weights are computed at the end
-        of each window except the first.
+        When the window has at least `window` steps, a new window begins. New weights are computed
+        at the end of each window except the first.
         """
         if self.method != "dwa":
             return
@@ -90,7 +90,7 @@ class TaskWeighting:
         self.counts[0] += 1
         if int(self.counts[0]) < self.window:
             return
-        means = self.sums / self.window
+        means = self.sums / int(self.counts[0])  # a resumed run can have counted more than `window`
         if int(self.counts[1]) > 0:
             previous = self.previous_means[self.learned].clamp_min(1e-12)
             ratios = means[self.learned] / previous / TEMPERATURE

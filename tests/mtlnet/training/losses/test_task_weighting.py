@@ -92,6 +92,18 @@ def test_restored_weighting_continues_alike() -> None:
     assert len(set(first.current_weights())) == 3
 
 
+def test_dwa_continues_with_a_shorter_window() -> None:
+    """Fewer frames have a shorter epoch. Constant losses have equal weights."""
+    first, second = weighting("dwa", steps_per_epoch=8), weighting("dwa", steps_per_epoch=2)
+    for _ in range(8 + 6):  # a whole window, and a part longer than the next window
+        first.update(TERMS)
+    second.restore(first.state())
+    for _ in range(5):
+        second.update(TERMS)
+        assert second.previous_means.tolist() == pytest.approx(TERMS.tolist())
+        assert second.current_weights() == pytest.approx([1.0, 1.0, 1.0])
+
+
 def test_an_unknown_method_is_refused() -> None:
     with pytest.raises(UserError, match="no balance 'best'; choose one of fixed, uncertainty, dwa"):
         TrainConfig(Path("data"), Path("out"), balance="best")
