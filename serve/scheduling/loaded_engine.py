@@ -19,11 +19,8 @@ class LoadedEngine:
     engine: Engine
     provenance: dict[str, str]
     cameras: Cameras
-
-    @property
-    def view(self) -> CameraParameters:
-        """The model's camera."""
-        return self.engine.card.camera
+    view: CameraParameters
+    """The model's camera."""
 
     def rectification(self, camera: str) -> Rectification:
         """Return the conversion from the camera of this name to the model's camera."""
@@ -38,7 +35,7 @@ class LoadedEngine:
             "engine": engine.kind,
             "precision": engine.precision,
         }
-        return cls(engine, provenance, cameras)
+        return cls(engine, provenance, cameras, engine.card.camera)
 
 
 @dataclass(frozen=True, slots=True)
