@@ -1,11 +1,10 @@
 """Saves and restores the state of a training run. A checkpoint is one safetensors file, written
 atomically.
 
-Its tensors are `network.NAME` (parameters and buffers, always with `target_mean` and `target_std`,
-the units of the heads), `optimiser.I.J.NAME` (state of parameter number J of optimizer
-number I), `balance.NAME` (state of the task weighting) and `rng` (state of torch's CPU generator in
-the first process, for dropout). Its metadata are `step` and `elapsed_s`, the seconds trained so
-far.
+Its tensors are `network.NAME`, `units.NAME` (`target_mean` and `target_std` of the network),
+`optimiser.I.J.NAME` (state of parameter number J of optimizer number I), `balance.NAME` (state of
+the task weighting) and `rng` (state of torch's CPU generator in the first process, for dropout).
+Its metadata are `step` and `elapsed_s`, the seconds trained so far.
 """
 
 from pathlib import Path
@@ -24,7 +23,7 @@ FOLDER = "checkpoints"
 MAX_CHECKPOINTS = 2
 UNITS = ("target_mean", "target_std")
 """Buffers of the network that its state dict lacks if it has no batch normalisation. Checkpoints of
-earlier versions lack them too; then those of the run's data are kept."""
+earlier versions have no `units.NAME`; then the values measured on the data are kept."""
 
 
 def save_checkpoint(run: Path, trainer: Trainer, elapsed_s: float) -> Path:
@@ -71,7 +70,8 @@ def list_checkpoints(run: Path) -> list[Path]:
 def _tensors(trainer: Trainer) -> dict[str, Tensor]:
     tensors = {f"network.{name}": t for name, t in trainer.network.state_dict().items()}
     for name in UNITS:
-        tensors[f"network.{name}"] = trainer.network.get_buffer(name)
+        # A copy, because safetensors refuses two tensors in the same memory.
+        tensors[f"units.{name}"] = trainer.network.get_buffer(name).clone()
     for number, optimizer in enumerate(trainer.optimizers.optimizers):
         for index, state in optimizer.state_dict()["state"].items():
             for name, value in state.items():
@@ -84,12 +84,9 @@ def _tensors(trainer: Trainer) -> dict[str, Tensor]:
 
 
 def _restore(trainer: Trainer, tensors: dict[str, Tensor]) -> None:
-    state = _with_prefix(tensors, "network.")
-    persistent = trainer.network.state_dict().keys()
-    for name in UNITS:
-        if name in state and name not in persistent:
-            trainer.network.get_buffer(name).copy_(state.pop(name))
-    trainer.network.load_state_dict(state)
+    trainer.network.load_state_dict(_with_prefix(tensors, "network."))
+    for name, tensor in _with_prefix(tensors, "units.").items():
+        trainer.network.get_buffer(name).copy_(tensor)
     for number, optimizer in enumerate(trainer.optimizers.optimizers):
         _restore_optimizer(optimizer, _with_prefix(tensors, f"optimiser.{number}."))
     trainer.task_weighting.restore(_with_prefix(tensors, "balance."))
