@@ -20,7 +20,7 @@ from mtlnet.training.configure import read_config
 from mtlnet.training.recipes import find_recipe
 from trackfeatures.errors import UserError
 
-PREFIX = "network."
+PREFIX, UNITS = "network.", "units."
 
 
 def publish_checkpoint(run: Path) -> int:
@@ -34,8 +34,11 @@ def publish_checkpoint(run: Path) -> int:
         raise UserError(f"{run} has no checkpoint; train again")
     with safe_open(checkpoints[-1], framework="pt") as file:
         step = int(file.metadata()["step"])
-        names = [name for name in file.keys() if name.startswith(PREFIX)]  # noqa: SIM118 no dict
-        weights = {name.removeprefix(PREFIX): file.get_tensor(name) for name in names}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 no dict
+    weights, units = (
+        {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+        for prefix in (PREFIX, UNITS)
+    )
     recipe = find_recipe(config.recipe)
     network = Network(
         batch_norm=recipe.batch_norm,
@@ -43,6 +46,8 @@ def publish_checkpoint(run: Path) -> int:
         architecture=find_architecture(config.network),
     )
     network.load_state_dict(weights)
+    for name, unit in units.items():
+        network.get_buffer(name).copy_(unit)
     provenance = Provenance(
         alpha=config.alpha,
         recipe=config.recipe,

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.images import encode
+from mtlnet.data.labels_file import LABELS
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction
 from mtlnet.sources.read import SourceImage
@@ -84,9 +85,14 @@ def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
 
 def require_inputs_kept(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
     """Raise UserError if one of `outputs` is one of the files `inputs`, also by another name or
-    link, or is a folder in which one of `inputs` has a name like those of `PictureWriter`."""
-    places = {_place(path) for path in inputs} - {None}
+    link, is the labels.csv beside one of them, or is a folder in which one of `inputs` has a name
+    like those of `PictureWriter`."""
+    read = list(inputs)
+    places = {_place(path) for path in read} - {None}
+    labels = {_place(folder / LABELS) for folder in {path.parent for path in read}} - {None}
     for output in outputs:
+        if _place(output) in labels:
+            raise UserError(f"--out {output} holds the labels of the pictures; give another file")
         if _place(output) in places:
             raise UserError(f"--out {output} is a file to read; give another one")
         for path in output.glob(PICTURE_NAMES):

@@ -210,6 +210,16 @@ def test_pictures_are_drawn_into_the_folder_of_their_images(
     assert image.read_bytes() == before
 
 
+def test_the_labels_of_the_pictures_are_not_overwritten(
+    tmp_path: Path, engine: BrightnessEngine
+) -> None:
+    image, labels = write_jpeg(tmp_path / "a.jpg", 10), tmp_path / "labels.csv"
+    labels.write_text("file,ml,mr\n")
+    with pytest.raises(UserError, match="holds the labels of the pictures"):
+        predict_files(engine, [str(image)], [labels])
+    assert labels.read_text() == "file,ml,mr\n"
+
+
 def test_a_damaged_input_is_not_overwritten(tmp_path: Path, engine: BrightnessEngine) -> None:
     film = tmp_path / "cut.mp4"
     film.write_bytes(b"\0\0\0\x18ftypmp42")
