@@ -144,10 +144,9 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode of each car, or of the cars in the mask `options["reset_mask"]` (N,)
-        bool; returns the observations of all cars, and infos that contain only the cars that were
-        reset, as their masks say. The options "s", "to_middle", "angle"
-        and "speed" are a number, a list with one value for each car, or a range
-        (least, greatest)."""
+        bool; returns the observations of all cars, and infos of the cars that were reset. "s",
+        "to_middle", "angle" and "speed" are a number, a list with one value for each car, or a
+        range (least, greatest)."""
         if self.closed:
             raise UserError("this environment is closed; make a new one")
         given = reset_options(options)
@@ -156,8 +155,6 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         for number in np.flatnonzero(chosen).tolist():
             with naming_car(number, self.num_envs):
                 self._cars.drives[number].check(starts[number])
-        if isinstance(seed, int):
-            self._np_random, self._np_random_seed = seeding.np_random(seed)
         if not self._rngs:
             self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
         for number in np.flatnonzero(chosen).tolist():
