@@ -32,6 +32,7 @@ from datagen.recording.folder import (
 )
 from datagen.recording.manifest import planned_split, rebuild
 from runtime.files import file_hash
+from trackfeatures.camera import CameraParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +165,10 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
 
 def _require_one_camera(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> None:
     """Raise DatasetError if the rounds of two folders were planned with different cameras."""
-    holders: dict[str, Path] = {}
+    holders: dict[CameraParameters, Path] = {}
     for plan, folder in zip(plans, folders, strict=True):
         for entry in plan["rounds"]:
-            holders.setdefault(json.dumps(entry["nominal_camera"], sort_keys=True), folder)
+            holders.setdefault(CameraParameters(**entry["nominal_camera"]), folder)
     if len(holders) > 1:
         (one, folder), (other, another) = list(holders.items())[:2]
         raise DatasetError(

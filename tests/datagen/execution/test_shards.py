@@ -129,6 +129,16 @@ def test_merge_refuses_other_cameras_and_copies_nothing(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"/1 and .*/2 have different cameras"):
         merge([tmp_path / "1", tmp_path / "2"], tmp_path / "both")
     assert not (tmp_path / "both").exists()
+    # A plan that states the same camera with fewer keys and as whole numbers.
+    plan = (tmp_path / "1" / "plan.json").read_text().replace('"y": 0.0', '"y": 0')
+    (tmp_path / "2" / "plan.json").write_text(plan.replace('"id": "1-', '"id": "2-'))
+    entries = json.loads((tmp_path / "2" / "plan.json").read_text())
+    for entry in entries["rounds"]:
+        entry["seed"] += 1000
+        del entry["nominal_camera"]["pitch_deg"]
+    (tmp_path / "2" / "plan.json").write_text(json.dumps({**entries, "hash": "0" * 64}))
+    with pytest.raises(DatasetError, match="no folder has a finished round"):
+        merge([tmp_path / "1", tmp_path / "2"], tmp_path / "both")
 
 
 def test_merge_on_a_full_disk_names_the_file_that_it_writes(
