@@ -123,7 +123,7 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
             for row in reader:
                 where = f"{table}, line {reader.line_num}"
                 if None in row or None in row.values():
-                    raise UserError(f"{where}: it has not {len(names)} values")
+                    raise UserError(f"{where}: it does not have {len(names)} values")
                 first = lines.setdefault(row["file"], reader.line_num)
                 if first != reader.line_num:
                     raise UserError(f"{where}: {row['file']} stands in line {first} already")
