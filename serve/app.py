@@ -14,7 +14,7 @@ from fastapi import FastAPI
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from mtlnet.inference.engine import Engine
+from mtlnet.inference.engine import Engine, view_count
 from serve import problems
 from serve.api import kserve, schemas
 from serve.api.access import PROBES, Access
@@ -174,7 +174,8 @@ def _add_status(app: FastAPI, frames: FrameHandler) -> None:
         loaded = frame_queue.loaded
         card = asdict(loaded.engine.card, dict_factory=stored)
         known = {name: camera.as_dict() for name, camera in loaded.cameras.items()}
-        return {**loaded.provenance, **card, "cameras": known}
+        views = view_count(loaded.engine)
+        return {**loaded.provenance, **card, "views": views, "cameras": known}
 
 
 def _add_metrics(app: FastAPI, service: Service) -> None:

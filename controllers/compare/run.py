@@ -259,7 +259,8 @@ def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
 
 def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
     """Return, for each drive, a hash of the inputs that its cell does not contain: the tuned
-    parameters, the road, the controller's files, and the weights of the model."""
+    parameters, the road, the controller's files, and the weights of the model (for a service, also
+    the precision of its answers and its number of views)."""
     tracks = {
         name: find_track(name, config.tracks_dir).driving_hash.encode()
         for name in dict.fromkeys(cell.track for cell in todo)
@@ -283,7 +284,7 @@ def _model_of(config: CompareConfig, perception: str) -> str:
     """Return the hash of the weights of the perception's model; "" for `truth` (no model)."""
     if perception == "truth":
         return ""
-    return model_hash(config.model) if perception == "model" else service_model_hash(perception)
+    return model_hash(config.model) if perception == "model" else service_identity(perception)
 
 
 def _files_of(controller: str) -> list[Path]:
@@ -306,11 +307,12 @@ def model_hash(run: str) -> str:
     return read_card(resolve_run(run)).model_hash
 
 
-def service_model_hash(url: str) -> str:
-    """Return the SHA-256 of a service's weights. Raises UserError if `url` does not answer."""
+def service_identity(url: str) -> str:
+    """Return what determines the answers of the service at `url` (`ServiceModel.identity`). Raises
+    UserError if it does not answer."""
     service = ServiceModel(url)
     service.close()
-    return service.model_hash
+    return service.identity
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 Each source is a function of the simulated world that returns `Perceived`.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -91,7 +92,10 @@ class ServiceModel:
         card = self._client.model()
         tf.require_version(str(card.get("definitions_version")), f"the service at {url}")
         self.camera: CameraParameters = parse_camera(card.get("camera"))
-        self.model_hash = str(card.get("model_hash"))
+        known = ("model_hash", "engine", "precision", "views")
+        self.identity = json.dumps({name: card.get(name) for name in known})
+        """Hash of the weights, library, precision and number of views with which the service
+        computes its answers, as JSON."""
 
     def predict(self, image: Image) -> dict[str, Any]:
         return self._client.features(encode(image, "jpeg"))  # like the recorded training images

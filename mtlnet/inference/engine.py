@@ -124,6 +124,11 @@ class ViewAverage:
         return mean_outputs(np.stack(found))
 
 
+def view_count(engine: Engine) -> int:
+    """Return the number of views of each image whose outputs `engine` averages."""
+    return engine.views.count if isinstance(engine, ViewAverage) else 1
+
+
 class OpenVinoEngine:
     """The model's OpenVINO graph, compiled for this CPU."""
 

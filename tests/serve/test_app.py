@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mtlnet.inference.engine import ViewAverage
 from serve.app import Service
 from serve.shared_memory import create_shared_memory
 from tests.serve.conftest import (
@@ -107,6 +108,12 @@ def test_the_model_card_is_served(service: Served) -> None:
     model = service.ask("GET", "/model").content
     assert model["model"] == CARD.model_hash
     assert model["camera"]["fov_y_deg"] == 67.5
+    assert model["views"] == 1
+
+
+def test_the_number_of_views_is_served() -> None:
+    with serving(ViewAverage(constant_engine(), 2)) as service:
+        assert service.ask("GET", "/model").content["views"] == 2
 
 
 @pytest.mark.parametrize(

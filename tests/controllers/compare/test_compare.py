@@ -156,7 +156,7 @@ def test_a_drive_on_a_model_depends_on_its_weights(
     codes = []
     for weights in ("one", "other"):
         monkeypatch.setattr(comparison, "model_hash", lambda run, weights=weights: weights)
-        monkeypatch.setattr(comparison, "service_model_hash", lambda url, weights=weights: weights)
+        monkeypatch.setattr(comparison, "service_identity", lambda url, weights=weights: weights)
         codes.append(list(fingerprints(config, cells(config)).values()))
     assert codes[0][0] == codes[1][0]
     assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3

@@ -134,6 +134,16 @@ def test_an_image_is_sent_to_the_service_as_jpeg(client: type[FakeClient]) -> No
     assert service.camera == CameraParameters(width=84, height=63)
 
 
+def test_the_identity_of_a_service_contains_its_views(
+    client: type[FakeClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = set()
+    for views in (1, 2, 2):
+        monkeypatch.setattr(client, "card", {**client.card, "views": views})
+        found.add(ServiceModel("http://127.0.0.1:8000").identity)
+    assert len(found) == 2
+
+
 def test_a_service_with_other_definitions_or_no_camera_is_refused(
     client: type[FakeClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:
