@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
 from datagen.recording.integrity.recover import recover
 from datagen.recording.integrity.verify import verify
-from datagen.recording.splits import read_split, split_path
+from datagen.recording.splits import read_split, split_path, write_split
 from tests.datagen.commands import datagen_here, make_small_plan
 from trackfeatures.camera import CameraParameters
 
@@ -253,6 +254,23 @@ def test_a_recovered_round_stays_in_a_dataset_that_is_collected_again(
     assert f"{40 + saved}/{40 + saved} frames" in done.stderr
     initialise_folder(folder, make_small_plan(3, 20))
     assert Dataset.open(folder).rounds  # readers can also open it while rounds are recorded
+
+
+@pytest.mark.parametrize("left_out", [True, False])
+def test_a_split_of_the_users_own_stays_when_collected_again(
+    whole: Path, tmp_path: Path, *, left_out: bool
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(whole, folder)
+    planned = read_split(split_path(folder))
+    swapped = replace(planned, train=planned.test, test=planned.train)
+    own = replace(planned, train=planned.train[1:]) if left_out else swapped
+    write_split(split_path(folder), own)
+    (folder / "rounds" / "round-002.mcap").unlink()  # recorded again
+    done = datagen_here("collect", *ROUNDS, "--out", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    assert read_split(split_path(folder)) == own
+    assert Dataset.open(folder).content_hash == json.loads(done.stdout)["content_hash"]
 
 
 def test_a_recovered_round_is_merged(whole: Path, tmp_path: Path) -> None:
