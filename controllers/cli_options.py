@@ -6,14 +6,14 @@ several commands share are defined here. Rich reads help texts as markup and dro
 brackets, so a default that Typer cannot show is written as a sentence ("Default: ...").
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import fields
 from functools import wraps
 from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
-from typer import Option
+from typer import Context, Option
 
 from runtime.cli import AsJson
 
@@ -86,6 +86,23 @@ def options(
     The options of the command are the annotated fields of the dataclass `config`, with their
     defaults, and --json, a flag whose value is `as_json`.
     """
+
+    def decorate(function: Callable[[Config, bool], None]) -> Callable[..., None]:
+        @options_and_given(config)
+        @wraps(function)
+        def command(configuration: Config, as_json: bool, given: Container[str]) -> None:
+            function(configuration, as_json)
+
+        return command
+
+    return decorate
+
+
+def options_and_given(
+    config: type[Config],
+) -> Callable[[Callable[[Config, bool, Container[str]], None]], Callable[..., None]]:
+    """Return a decorator like `options` for a function `f(configuration, as_json, given)`; `given`
+    contains the names of the fields whose options the user has given, also with default values."""
     declared = [
         Parameter(
             one.name, Parameter.KEYWORD_ONLY, default=one.default, annotation=_option(one.type)
@@ -94,13 +111,18 @@ def options(
         if get_origin(one.type) is Annotated
     ]
     as_json = Parameter("as_json", Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+    context = Parameter("context", Parameter.KEYWORD_ONLY, annotation=Context)
 
-    def decorate(function: Callable[[Config, bool], None]) -> Callable[..., None]:
+    def decorate(function: Callable[[Config, bool, Container[str]], None]) -> Callable[..., None]:
         @wraps(function)
-        def command(as_json: bool, **values: Any) -> None:
-            function(config(**values), as_json)
+        def command(context: Context, as_json: bool, **values: Any) -> None:
+            sources = {name: context.get_parameter_source(name) for name in values}
+            given = {name for name, one in sources.items() if one and one.name != "DEFAULT"}
+            function(config(**values), as_json, given)
 
-        command.__signature__ = Signature([*declared, as_json])  # type: ignore[attr-defined]
+        command.__signature__ = Signature(  # type: ignore[attr-defined]
+            [context, *declared, as_json]
+        )
         return command
 
     return decorate

@@ -1,16 +1,16 @@
 """The command `controllers train`. Run: `controllers train --algorithm td3 --track forza`."""
 
+from collections.abc import Container
 from dataclasses import fields, replace
-from typing import Annotated, get_origin
 
-from controllers.cli_options import options
+from controllers.cli_options import options_and_given
 from controllers.rl.config import TrainConfig, resolve
 from runtime import cli as command
 from trackfeatures.errors import UserError
 
 
-@options(TrainConfig)
-def train(config: TrainConfig, as_json: bool) -> None:
+@options_and_given(TrainConfig)
+def train(config: TrainConfig, as_json: bool, given: Container[str]) -> None:
     """Train an actor, a network that computes the steering, by reinforcement learning.
 
     At intervals (--evaluate-every) the present actor is evaluated in drives without exploration
@@ -23,7 +23,7 @@ def train(config: TrainConfig, as_json: bool) -> None:
 
     from controllers.rl.training import train as run
 
-    config = _continued(config) if config.resume else resolve(config)
+    config = _continued(config, given) if config.resume else resolve(config)
     name = escape(f"{config.algorithm} on {config.track}")
     with command.progress_bar() as bar:
         task = bar.add_task(name, total=config.steps)
@@ -41,21 +41,20 @@ def train(config: TrainConfig, as_json: bool) -> None:
     command.print_result(result, as_json, line)
 
 
-def _continued(given: TrainConfig) -> TrainConfig:
-    """Return the options stored in the folder `given.out`, with the threads of `given`.
+def _continued(config: TrainConfig, given: Container[str]) -> TrainConfig:
+    """Return the options stored in the folder `config.out`, with the threads of `config`.
 
-    Raises UserError if any other option of `given` differs both from its default and from the
-    stored option.
+    `given`: names of the options that the user has given. Raises UserError if another of these
+    options differs from the stored option.
     """
     from controllers.rl.run_folder import UNCOMPARED, stored_config
 
-    stored, default = stored_config(given.out), TrainConfig()
+    stored = stored_config(config.out)
     for field in fields(TrainConfig):
-        name, value = field.name, getattr(given, field.name)
-        declared = get_origin(field.type) is Annotated and name not in UNCOMPARED
-        if declared and value not in (getattr(default, name), getattr(stored, name)):
+        name, value = field.name, getattr(config, field.name)
+        if name in given and name not in UNCOMPARED and value != getattr(stored, name):
             raise UserError(
-                f"{given.out} was started with {name} {getattr(stored, name)}, now {value} is "
+                f"{config.out} was started with {name} {getattr(stored, name)}, now {value} is "
                 "given; leave it out to continue, or start another training with another --out"
             )
-    return replace(stored, threads=given.threads)
+    return replace(stored, threads=config.threads)
