@@ -54,6 +54,7 @@ class LabelFolder:
         self._model = model
         self._lock = Lock()
         self._rows: tuple[object, dict[str, Cells]] = (None, {})
+        self._removed: dict[str, Cells] = {}  # a new label keeps their camera and other columns
         self._picture: tuple[object, NDArray[np.uint8]] = (None, np.empty(0, np.uint8))
         self.files = self._find()
         if not self.files:
@@ -133,7 +134,7 @@ class LabelFolder:
         Its pitch is the pitch in the picture's row, if the row has one. Raises UserError for a
         faulty camera file, and for a camera with another aspect ratio.
         """
-        row = self.rows().get(self.files[number], {})
+        row = self._last_row(self.files[number])
         name = row.get("camera") or CAMERA_FILE
         path = self.folder / name
         if not path.resolve().is_relative_to(self.folder):
@@ -173,7 +174,7 @@ class LabelFolder:
         with self._lock:
             rows = self.rows()
             name = self.files[number]
-            old = rows.get(name, {})
+            old = self._last_row(name)
             row = {
                 **{k: v for k, v in old.items() if k in KEPT},
                 **{k: v for k, v in texts.items() if k in ("drive", "light")},
@@ -193,7 +194,12 @@ class LabelFolder:
         with self._lock:
             rows, name = self.rows(), self.files[number]
             if name in rows:
+                self._removed[name] = rows[name]
                 self._write({each: row for each, row in rows.items() if each != name})
+
+    def _last_row(self, name: str) -> Cells:
+        """Return the row of the picture `name`, or the row that was removed; else an empty dict."""
+        return self.rows().get(name) or self._removed.get(name, {})
 
     def _write(self, rows: dict[str, Cells]) -> None:
         if rows:

@@ -227,3 +227,19 @@ def test_a_faulty_row_is_refused_at_the_start_and_later(site: Site, row: str, fa
     with pytest.raises(UserError, match=rf"labels\.csv, line 3: {fault}"):
         LabelFolder(site.folder, None, CameraParameters())
     assert row in table.read_text()
+
+
+def test_a_removed_label_can_be_restored_with_its_camera_and_columns(site: Site) -> None:
+    (site.folder / "camera.yaml").rename(site.folder / "front.yaml")
+    table = site.folder / "labels.csv"
+    row = "1.png,,,-3.300,0.300,3.900,0,?,front.yaml,night,0.05"
+    table.write_text(f"file,ml,mr,l,m,r,angle,heading,camera,light,std_m\n{row}\n")
+    before = [cells for _, cells in read_cells(table)]
+    _, shown, _ = site.ask("GET", "/api/pictures/0")
+    assert site.ask("DELETE", "/api/pictures/0/label")[0] == 200
+    assert site.ask("GET", "/api/pictures/0")[1]["source"] != "label"
+    assert site.ask("PUT", "/api/pictures/0/label", shown["markings"])[0] == 200
+    ((_, after),) = read_cells(table)
+    assert {name: after[name] for name in ("camera", "light", "std_m", "r")} == {
+        name: before[0][name] for name in ("camera", "light", "std_m", "r")
+    }
