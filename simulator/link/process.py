@@ -51,6 +51,9 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
             return Simulation(world, record, image, seed=config.seed, camera=camera)
 
         _warm_up(simulation, config)
+        # Before the server: a signal while it starts or ends must not keep it from removing the
+        # segment.
+        interrupted = stack.enter_context(interrupts(signal.SIGINT, signal.SIGTERM))
         server = stack.enter_context(
             LinkServer(
                 config.name,
@@ -62,10 +65,9 @@ def run(config: LinkConfig, report: Callable[[str], None]) -> Summary:
             )
         )
         report(f"{config.name}: {road.track.name} is ready for a client")
-        with interrupts(signal.SIGINT, signal.SIGTERM) as interrupted:
-            server.serve(interrupted)
-            if interrupted():
-                report(f"{config.name}: stopped")
+        server.serve(interrupted)
+        if interrupted():
+            report(f"{config.name}: stopped")
         return server.summary
 
 

@@ -10,12 +10,30 @@ from pathlib import Path
 
 import pytest
 
+from simulator.link.client import Link
 from simulator.link.errors import LinkError, NameInUse, NoServer
 from simulator.link.layout import MAGIC
 from simulator.link.segment import Segment, attach, check_name, create, remove_stale
+from tests.simulator.link.conftest import START_S
 
 SIZE = 4096
 SHM = Path("/dev/shm")
+
+ENDING_SERVER = """
+import signal, sys
+from simulator.link import process
+from simulator.link.server import LinkServer
+
+original = LinkServer.close
+
+def close(server):
+    signal.raise_signal(signal.SIGTERM)
+    original(server)
+
+LinkServer.close = close
+process.run(process.LinkConfig(name=sys.argv[1], track="oval"), print)
+"""
+"""A server that receives a signal after a client has ended it."""
 
 
 def server_end(name: str) -> Segment:
@@ -174,3 +192,13 @@ def test_a_forked_child_does_not_hold_the_parents_lock(name: str) -> None:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         ours.close()
+
+
+def test_a_signal_while_the_server_ends_leaves_no_segment(name: str) -> None:
+    process = subprocess.Popen([sys.executable, "-c", ENDING_SERVER, name])
+    try:
+        Link(name, wait_s=START_S).quit()
+        assert process.wait(START_S) == 0
+        assert not (SHM / name[1:]).exists()
+    finally:
+        process.kill()
