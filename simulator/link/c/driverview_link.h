@@ -298,10 +298,11 @@ DRVLINK_ASSERT(sizeof(struct drvlink_state) == 960);
  * while (!drvlink_step(&link, steer, throttle, 0.0, 1)) { ... link.state.to_middle ... }
  * drvlink_detach(&link);
  *
- * Every function returns 0, or -1 with a message in link.error. After a refusal (link.state.error
- * is not 0) the link stays usable and the state of the car is unchanged; after any other error the
- * link is unusable. `link.image`, if set to a buffer of link.header.image_bytes bytes, receives the
- * image of every message. One thread at a time; no fork() without exec(): it would share the lock.
+ * Every function returns 0, or -1 with a message in link.error; drvlink_latest also returns 1.
+ * After a refusal (link.state.error is not 0) the link stays usable and the state of the car is
+ * unchanged; after any other error the link is unusable. `link.image`, if set to a buffer of
+ * link.header.image_bytes bytes, receives the image of every message. One thread at a time; no
+ * fork() without exec(): it would share the lock.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -326,7 +327,7 @@ struct drvlink {
     double timeout_s;               /* for an answer; 2 s unless you change it */
     char error[512];
     /* Internal: */
-    int fd;
+    int fd, torn; /* torn: `image` is a copy during which the server wrote */
     uint8_t *memory;
     char name[256];
 };
@@ -382,7 +383,8 @@ static inline void drvlink_copy(void *to, const uint8_t *from, size_t count) {
     }
 }
 
-/* The newest message into link->state, if it is whole and newer: 1, else 0; -1 if it is damaged. */
+/* The newest message into link->state, if it is whole and newer: 1, else 0; -1 if it is damaged.
+ * After 0, link->image is the image of link->state unless link->torn. */
 static inline int drvlink_read(struct drvlink *link) {
     const uint8_t *block = link->memory + DRVLINK_STATE_OFFSET;
     const uint32_t *sequence = (const uint32_t *)(const void *)block;
@@ -397,7 +399,8 @@ static inline int drvlink_read(struct drvlink *link) {
             drvlink_copy(link->image, link->memory + DRVLINK_IMAGE_OFFSET,
                          link->header.image_bytes / 8);
         __atomic_thread_fence(__ATOMIC_ACQUIRE);
-        if (__atomic_load_n(sequence, __ATOMIC_RELAXED) != begun) continue;
+        link->torn = __atomic_load_n(sequence, __ATOMIC_RELAXED) != begun;
+        if (link->torn) continue;
         memcpy(&link->state, words, sizeof words);
         link->state.sequence = begun;
         if (drvlink_checksum(words, WORDS) == link->state.check) return 1;
@@ -418,8 +421,8 @@ static inline void drvlink_wait(struct drvlink *link) {
     syscall(SYS_futex, sequence, 0 /* FUTEX_WAIT */, now, &limit, NULL, 0);
 }
 
-/* The newest message, without a request. 1 if there was a new one, 0 if not, -1 on an error. */
-static inline int drvlink_latest(struct drvlink *link) {
+/* As drvlink_read; -1 also if there is no message and the server has ended. */
+static inline int drvlink_poll(struct drvlink *link) {
     int running = drvlink_server_lives(link), came = drvlink_read(link);
     if (came || running) return came;
     int closed = ((struct drvlink_header *)(void *)link->memory)->phase == DRVLINK_PHASE_CLOSED;
@@ -427,6 +430,34 @@ static inline int drvlink_latest(struct drvlink *link) {
              "the server of %s (process %llu) has %s; start it again", link->name,
              (unsigned long long)link->header.engine_pid, closed ? "ended" : "died");
     return -1;
+}
+
+/* 0 if the link is attached, else -1 with a message: that of the failed attach, if there is one. */
+static inline int drvlink_attached(struct drvlink *link) {
+    if (link->memory) return 0;
+    if (!link->error[0])
+        snprintf(link->error, sizeof link->error, "the link %s is closed; attach again",
+                 link->name);
+    return -1;
+}
+
+static inline int drvlink_timed_out(struct drvlink *link) {
+    snprintf(link->error, sizeof link->error,
+             "the server of %s (process %llu) is running, but has not answered within %g s",
+             link->name, (unsigned long long)link->header.engine_pid, link->timeout_s);
+    return -1;
+}
+
+/* The newest message, without a request. 1 if there was a new one, 0 if not, -1 on an error.
+ * Waits for at most timeout_s, and only while the server is writing a message. */
+static inline int drvlink_latest(struct drvlink *link) {
+    if (drvlink_attached(link)) return -1;
+    for (double until = drvlink_now() + link->timeout_s;;) {
+        int came = drvlink_poll(link);
+        if (came || !link->torn) return came;
+        if (drvlink_now() > until) return drvlink_timed_out(link);
+        drvlink_wait(link);
+    }
 }
 
 static inline void drvlink_send(struct drvlink *link) {
@@ -449,22 +480,19 @@ static inline void drvlink_send(struct drvlink *link) {
 
 /* Sends link->command and waits for the message that answers it. */
 static inline int drvlink_ask(struct drvlink *link) {
-    if (!link->memory) return -1; /* never attached, or closed; link->error says why */
+    if (drvlink_attached(link)) return -1;
     drvlink_send(link);
     for (double until = drvlink_now() + link->timeout_s; drvlink_now() < until;) {
         drvlink_wait(link);
         int came = drvlink_read(link);
-        if (!came) came = drvlink_latest(link);
+        if (!came) came = drvlink_poll(link);
         if (came < 0) return -1;
         if (link->state.session != link->command.session) continue;
         if (link->state.answers != link->command.number) continue;
         snprintf(link->error, sizeof link->error, "%.255s", link->state.error_text);
         return link->state.error ? -1 : 0;
     }
-    snprintf(link->error, sizeof link->error,
-             "the server of %s (process %llu) is running, but has not answered within %g s", link->name,
-             (unsigned long long)link->header.engine_pid, link->timeout_s);
-    return -1;
+    return drvlink_timed_out(link);
 }
 
 static inline int drvlink_reset_at(struct drvlink *link, int64_t seed, double s, double to_middle,
