@@ -7,6 +7,9 @@ and of the angle (rad); `out_of_distribution` (1, 1), 0 or 1; `absent` (1, 5), t
 absence in the order of the distances; `to_lane_centre_m` (1, 1), `angle_rad` (1, 1) and `heading`
 (1, 3) as in POST /features. The options of an image are the same as for POST /features, in headers,
 in the query, or in `parameters`.
+
+As in Triton, the parameters `binary_data` and `binary_data_output` select JSON or binary outputs,
+not the header Accept, which many clients set to application/json for all requests.
 """
 
 import asyncio

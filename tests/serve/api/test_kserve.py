@@ -107,6 +107,19 @@ def test_raw_binary_in_and_out(service: Served, engine: FakeEngine) -> None:
     assert np.array_equal(engine.images[-1], sent)
 
 
+@pytest.mark.parametrize("accept", ["application/json", "application/octet-stream", "*/*"])
+def test_parameters_and_not_accept_select_the_type_of_the_answer(
+    service: Served, accept: str
+) -> None:
+    for binary, expected in ((True, "application/octet-stream"), (False, "application/json")):
+        outputs = [{"name": "heading", "parameters": {"binary_data": binary}}]
+        reply = infer(service, {"inputs": [BASE64], "outputs": outputs}, Accept=accept)
+        assert (reply.status, reply.headers["content-type"]) == (200, expected)
+        assert ("inference-header-content-length" in reply.headers) == binary
+    described = service.ask("GET", "/openapi.json").content["paths"][INFER]["post"]["responses"]
+    assert "`Accept` does not select the type" in described["200"]["description"]
+
+
 @pytest.mark.parametrize(
     ("content", "binary", "name"),
     [
