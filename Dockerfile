@@ -1,9 +1,12 @@
-# Three images from one source: `docker build --target serve|train|collect -t driverview-TARGET .`
+# Three images from one source (deploy/kubernetes uses the image `serve` with this tag):
 #
-#   docker run -p 8000:8000 -e DRIVERVIEW_TOKEN -v "$PWD/runs:/driverview/runs:ro" driverview-serve
-#   docker run -v "$PWD/datasets:/driverview/datasets" driverview-collect datagen collect --rounds 60
+#   docker build --target serve|train|collect -t driverview-TARGET:0.2.0 .
+#   docker run -p 8000:8000 -e DRIVERVIEW_TOKEN -v "$PWD/runs:/driverview/runs:ro" \
+#     driverview-serve:0.2.0
+#   docker run -v "$PWD/datasets:/driverview/datasets" \
+#     driverview-collect:0.2.0 datagen collect --rounds 60
 #   docker run --gpus all -v "$PWD/datasets:/driverview/datasets:ro" -v "$PWD/runs:/driverview/runs" \
-#     driverview-train mtlnet train --alpha 0.3,0.2,0.5
+#     driverview-train:0.2.0 mtlnet train --alpha 0.3,0.2,0.5
 #
 # The processes run as user 10001: folders they write to must let it (`chown 10001 runs datasets`).
 

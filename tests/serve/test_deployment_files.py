@@ -112,6 +112,20 @@ def test_references_between_manifests_resolve() -> None:
     assert deployment["spec"]["template"]["spec"]["containers"][0]["image"] == named
 
 
+def test_images_have_the_projects_version_as_tag_everywhere() -> None:
+    """`kubectl apply -k` uses the image that the documented commands build."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    (image,) = manifest("kustomization.yaml")["images"]
+    assert image == {"name": "driverview-serve", "newTag": version}
+    named = re.compile(r"\bdriverview-(?:serve|train|collect|TARGET)\b(?![`=])(\S*)")
+    names = 0
+    for path in (ROOT / "Dockerfile", DEPLOY / "compose.yaml", ROOT / "docs/how-to/deploy.md"):
+        tags = named.findall(path.read_text())
+        assert {tag.rstrip("`.,") for tag in tags} == {f":{version}"}, path
+        names += len(tags)
+    assert names >= 6
+
+
 def test_serving_image_has_neither_torch_nor_simulator() -> None:
     stage = DOCKERFILE.split("FROM base AS serve")[1]
     assert "[" not in stage.split("pip install")[1].split("\n")[0].replace(
@@ -146,7 +160,7 @@ def test_images_get_every_package_and_only_files_of_known_hashes() -> None:
 def test_images_of_others_are_pinned_by_digest() -> None:
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     (base,) = re.findall(r"^ARG PYTHON_IMAGE=(.+)$", DOCKERFILE, flags=re.MULTILINE)
-    images = [base, *(service["image"] for service in services.values() if "image" in service)]
+    images = [base, *(found["image"] for found in services.values() if "build" not in found)]
     assert len(images) == 2
     for image in images:
         assert re.search(r"[\w/]+:[\w.-]+@sha256:[0-9a-f]{64}\b", image), image
