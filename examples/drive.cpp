@@ -19,13 +19,19 @@
 // m left of the lane's centre, NaN where no lane is seen; rad, positive when the car points right.
 struct Road { float offset, angle; };
 
+// A connection to the first address of `host` that answers.
 static int dial(const char *host, const char *port) {
     addrinfo hints{}, *found = nullptr;
     hints.ai_socktype = SOCK_STREAM;
     if (getaddrinfo(host, port, &hints, &found)) throw std::runtime_error("unknown host");
-    const int connection = socket(found->ai_family, found->ai_socktype, found->ai_protocol), yes = 1;
-    if (connect(connection, found->ai_addr, found->ai_addrlen)) throw std::runtime_error("no service");
+    int connection = -1, yes = 1;
+    for (const addrinfo *at = found; at && connection < 0; at = at->ai_next) {
+        connection = socket(at->ai_family, at->ai_socktype, at->ai_protocol);
+        if (connection < 0 || !connect(connection, at->ai_addr, at->ai_addrlen)) continue;
+        close(connection), connection = -1;
+    }
     freeaddrinfo(found);
+    if (connection < 0) throw std::runtime_error("no service");
     setsockopt(connection, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
     return connection;
 }
@@ -72,7 +78,9 @@ int main(int count, char **words) try {
     check(drvlink_attach(&link, words[1], 180.0)), link.timeout_s = 30.0;
     const drvlink_header &world = link.header;
     const drvlink_state &car = link.state;
-    const std::string request = request_for(world, words[2] + std::string(":") + words[3]);
+    std::string host(words[2], strcspn(words[2], "%"));  // without the zone of an IPv6 address
+    if (strchr(words[2], ':')) host = "[" + host + "]";
+    const std::string request = request_for(world, host + ":" + words[3]);
     const size_t bytes = size_t{3} * world.image_width * world.image_height;
     std::string image(world.image_bytes, 0);  // the bytes of the pixels, and up to 7 more
     link.image = reinterpret_cast<uint8_t *>(image.data());

@@ -1,5 +1,6 @@
 """examples/drive.cpp: a controller in C++ drives on the service's answers, over shared memory."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -7,20 +8,50 @@ from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from controllers.demo.process import free_port, running_service
 from simulator.track.road import Road
 from simulator.track.toml_track import read_toml_track
+from tests.serve.conftest import FakeEngine, outputs, serving
 from tests.simulator.link.conftest import fresh_name, start_server, stop
 
 SOURCE = Path(__file__).parents[2] / "examples" / "drive.cpp"
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
 LAP_LIMIT_S = 240.0
-MAX_LINES = 99
+MAX_LINES = 105
 HEAD = 'look = "countryside"\nsurface = "asphalt"\nwidth = 12.0\n'
 STRAIGHT = '[[segment]]\ntype = "straight"\nlength = 40.0\n'
 BEND = '[[segment]]\ntype = "bend"\nradius = 45.0\nangle = 90.0\nspiral = 20.0\n'
+
+TWO_ADDRESSES = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <netdb.h>
+#include <string.h>
+
+typedef int look_up(const char *, const char *, const struct addrinfo *, struct addrinfo **);
+
+int getaddrinfo(const char *host, const char *port, const struct addrinfo *hints,
+                struct addrinfo **found) {
+    look_up *real = (look_up *)dlsym(RTLD_NEXT, "getaddrinfo");
+    if (strcmp(host, "localhost")) return real(host, port, hints, found);
+    return real("::1", port, hints, found) || real("127.0.0.1", port, hints, &(*found)->ai_next);
+}
+"""
+"""A library in which `localhost` has the addresses ::1 and 127.0.0.1, in this order."""
+
+
+@pytest.fixture(scope="module")
+def two_addresses(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment in which `localhost` has two addresses."""
+    folder = tmp_path_factory.mktemp("addresses")
+    (folder / "addresses.c").write_text(TWO_ADDRESSES)
+    out = folder / "addresses.so"
+    command = ["gcc", "-shared", "-fPIC", "-o", str(out), str(folder / "addresses.c"), "-ldl"]
+    subprocess.run(command, check=True)
+    return {"LD_PRELOAD": str(out)}
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +89,13 @@ def link(track: Path) -> Iterator[str]:
     stop(process)
 
 
-def drive(program: Path, *words: object) -> subprocess.CompletedProcess[str]:
+def drive(program: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run the example with the arguments `words` and `more` environment variables."""
     command = [str(program), *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=LAP_LIMIT_S)
+    environment = {**os.environ, **more}
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=LAP_LIMIT_S, env=environment
+    )
 
 
 @pytest.mark.extended
@@ -94,6 +129,20 @@ def test_it_says_what_is_missing(program: Path) -> None:
 def test_without_a_service_it_ends_with_one_line(program: Path, link: str) -> None:
     done = drive(program, link, "127.0.0.1", free_port())
     assert (done.returncode, done.stderr) == (1, "error: no service\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("listens", "asked"), [("::1", "::1"), ("::1", "localhost"), ("127.0.0.1", "localhost")]
+)
+def test_it_asks_ipv6_and_every_address_of_a_name(
+    program: Path, link: str, two_addresses: dict[str, str], listens: str, asked: str
+) -> None:
+    """The car follows the answers: it turns left until it has left the road."""
+    turn = FakeEngine(lambda _image: outputs((-2.0, 2.0, np.nan, np.nan, np.nan), 0.5))
+    with serving(turn, host=listens) as service:
+        done = drive(program, link, asked, service.port, **two_addresses)
+    assert done.stderr == "error: the car has left the road\n"
 
 
 def test_it_is_short() -> None:
