@@ -54,7 +54,7 @@ class LabelFolder:
         self._model = model
         self._lock = Lock()
         self._rows: tuple[object, dict[str, Cells]] = (None, {})
-        self._removed: dict[str, Cells] = {}  # a new label keeps their camera and other columns
+        self._earlier: dict[str, list[Cells | None]] = {}  # for each file its rows before changes
         self._picture: tuple[object, NDArray[np.uint8]] = (None, np.empty(0, np.uint8))
         self.files = self._find()
         if not self.files:
@@ -172,9 +172,8 @@ class LabelFolder:
             bend = "left" if markings.curvature > 0 else "right"
             heading = bend if abs(markings.curvature) >= BEND_CURVATURE else "straight"
         with self._lock:
-            rows = self.rows()
             name = self.files[number]
-            old = self._last_row(name)
+            before, old = self.rows().get(name), self._last_row(name)
             row = {
                 **{k: v for k, v in old.items() if k in KEPT},
                 **{k: v for k, v in texts.items() if k in ("drive", "light")},
@@ -186,22 +185,40 @@ class LabelFolder:
                 "curvature_1pm": f"{markings.curvature:.6f}",
             }
             check_cells(row)
-            self._write({**rows, name: row})
+            self._replace(name, row)
+            self._earlier.setdefault(name, []).append(before)
         return row
 
     def remove(self, number: int) -> None:
         """Remove the label of a picture, if it has one."""
         with self._lock:
-            rows, name = self.rows(), self.files[number]
-            if name in rows:
-                self._removed[name] = rows[name]
-                self._write({each: row for each, row in rows.items() if each != name})
+            name = self.files[number]
+            before = self.rows().get(name)
+            if before is not None:
+                self._replace(name, None)
+                self._earlier.setdefault(name, []).append(before)
+
+    def undo(self, number: int) -> Cells | None:
+        """Undo the last saving or removal of a picture's label by this process, and return the
+        restored row; None if the picture had no label. Raises UserError if there is no change to
+        undo."""
+        with self._lock:
+            name = self.files[number]
+            if not self._earlier.get(name):
+                raise UserError(f"no earlier label of {name} is known")
+            self._replace(name, self._earlier[name][-1])
+            return self._earlier[name].pop()
 
     def _last_row(self, name: str) -> Cells:
-        """Return the row of the picture `name`, or the row that was removed; else an empty dict."""
-        return self.rows().get(name) or self._removed.get(name, {})
+        """Return the row of the picture `name`, or the last row that it had; else an empty dict."""
+        rows = [*self._earlier.get(name, ()), self.rows().get(name)]
+        return next((row for row in reversed(rows) if row is not None), {})
 
-    def _write(self, rows: dict[str, Cells]) -> None:
+    def _replace(self, name: str, new: Cells | None) -> None:
+        """Rewrite the file with the row `new` for the picture `name`; without a row for None."""
+        rows = {each: row for each, row in self.rows().items() if each != name}
+        if new is not None:
+            rows[name] = new
         if rows:
             write_cells(self.folder / LABELS, [rows[k] for k in sorted(rows, key=natural_key)])
         else:

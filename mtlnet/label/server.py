@@ -23,7 +23,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from mtlnet.data.labels_file import lane_sides
+from mtlnet.data.labels_file import Cells, lane_sides
 from mtlnet.inference.engine import Engine
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import decode_outputs
@@ -120,7 +120,8 @@ class Labeller:
 
         The markings come from the label; without a label from the model's answer; if the model
         finds no lane either, they are the markings of a lane 3.6 m wide with the car in its middle.
-        `source` states which of these three cases applies: "label", "model" or "usual".
+        `source` states which of these three cases applies: "label", "model" or "usual". A label
+        without a lane counts as no label here, and `note` describes this.
         """
         image = self.folder.picture(number)
         height, width = image.shape[:2]
@@ -128,13 +129,15 @@ class Labeller:
         row = self.folder.rows().get(self.folder.files[number])
         label = self.folder.markings(number, camera)
         answer, note = (None, "") if label else self._answer(image, camera)
+        if row is not None and label is None:
+            note = "the label has no lane; saving would replace it by the drawn lane"
         usual = Markings(*USUAL_LANE, camera.pitch_deg)
         return {
             "file": name_as_text(self.folder.files[number]),
             "width": width,
             "height": height,
             "camera_pitch_deg": camera.pitch_deg,
-            "row": None if row is None else {k: name_as_text(v) for k, v in row.items()},
+            "row": row_as_text(row),
             "source": "label" if label else "model" if answer else "usual",
             "note": note,
             **shown(camera, label or answer or usual),
@@ -188,26 +191,20 @@ def shown(camera: CameraParameters, markings: Markings) -> dict[str, Any]:
     return {"markings": asdict(markings), "lines": lines, "handles": handles(camera, markings)}
 
 
+def row_as_text(row: Cells | None) -> Cells | None:
+    """Return the cells of a row as text that can be encoded (`name_as_text`); None for None."""
+    return None if row is None else {name: name_as_text(text) for name, text in row.items()}
+
+
 def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
     """Make the page and its interface as an ASGI application.
 
     `names`: allowed Host and Origin names; `token`: None if requests need no token.
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    _answer_errors(app, labeller.folder.folder)
     last = len(labeller.folder.files) - 1
     number_type = Annotated[int, PathNumber(ge=0, le=last)]
-
-    @app.exception_handler(UserError)
-    async def refuse(_request: Any, error: UserError) -> Response:
-        # The page names its files without the folder's path on this machine.
-        told = str(error).replace(f"{labeller.folder.folder}/", "")
-        return JSONResponse({"detail": told}, 422, HEADERS)
-
-    @app.exception_handler(RequestValidationError)
-    async def refuse_form(_request: Any, error: RequestValidationError) -> Response:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        return JSONResponse({"detail": f"{where}: {first['msg']}"}, 422, HEADERS)
 
     def get_pictures() -> Response:
         return JSONResponse(labeller.listing(), headers=HEADERS)
@@ -226,13 +223,19 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
         texts = {"drive": label.drive, "light": label.light}
         given = {name: text.strip() for name, text in texts.items() if text is not None}
         row = labeller.folder.save(number, markings, label.heading, given)
-        return JSONResponse({k: name_as_text(v) for k, v in row.items()}, headers=HEADERS)
+        return changed(row)
 
     def delete_label(number: int) -> Response:
         labeller.folder.remove(number)
-        return JSONResponse({}, headers=HEADERS)
+        return changed(None)
 
-    for work in (get_picture, get_image, post_fit, put_label, delete_label):
+    def post_undo(number: int) -> Response:
+        return changed(labeller.folder.undo(number))
+
+    def changed(row: Cells | None) -> Response:
+        return JSONResponse({"row": row_as_text(row)}, headers=HEADERS)
+
+    for work in (get_picture, get_image, post_fit, put_label, delete_label, post_undo):
         work.__annotations__["number"] = number_type
     app.get("/api/pictures")(get_pictures)
     app.get("/api/pictures/{number}")(get_picture)
@@ -240,10 +243,26 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
     app.post("/api/pictures/{number}/fit")(post_fit)
     app.put("/api/pictures/{number}/label")(put_label)
     app.delete("/api/pictures/{number}/label")(delete_label)
+    app.post("/api/pictures/{number}/label/undo")(post_undo)
     for path in sorted(PAGE.iterdir()):
         route = "/" if path.name == "index.html" else f"/{path.name}"
         app.get(route)(_page_file(path))
     return _checked(app, names, token)
+
+
+def _answer_errors(app: FastAPI, folder: Path) -> None:
+    """Make `app` answer a UserError and a faulty request with one line of text, `detail`. The line
+    names files without the path of `folder` on this machine."""
+
+    @app.exception_handler(UserError)
+    async def refuse(_request: Any, error: UserError) -> Response:
+        return _refused(422, name_as_text(str(error).replace(f"{folder}/", "")))
+
+    @app.exception_handler(RequestValidationError)
+    async def refuse_form(_request: Any, error: RequestValidationError) -> Response:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        return _refused(422, f"{where}: {first['msg']}")
 
 
 def _page_file(path: Path) -> Callable[[], Response]:

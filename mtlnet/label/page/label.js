@@ -61,7 +61,7 @@ async function open(n) {
     if (n !== number) return;
     shown = structuredClone(data);
     image = bitmap;
-    $("heading").value = shown.source === "label" ? shown.row.heading : "";
+    $("heading").value = shown.row ? shown.row.heading : "";
     if (shown.row) { $("drive").value = shown.row.drive || ""; $("light").value = shown.row.light || ""; }
     say(shown.note);
   } catch (error) {
@@ -232,33 +232,29 @@ async function alone(work) {
 
 async function save() {
   if (!shown) return;
-  const of = number, picture = shown, texts = ["heading", "drive", "light"].map((id) => $(id).value);
+  const of = number, texts = ["heading", "drive", "light"].map((id) => $(id).value);
   await waiting;
-  const before = picture.source === "label" ? await (await call(`api/pictures/${of}`)).json() : null;
-  const row = await (await call(`api/pictures/${of}/label`, "PUT", label(picture.markings, ...texts))).json();
-  changed(of, true, before);
+  const { row } = await change(of, "label", "PUT", label(shown.markings, ...texts));
+  saves.push(of);
   document.body.dataset.saved = row.file;
   await open(Math.min(of + 1, pictures.length - 1));
   if (of === number) say("this was the last picture");
 }
 
-function changed(of, labelled, before) {
-  saves.push({ of, before });
-  pictures[of].labelled = labelled;
+async function change(of, path, method, body) {
+  const answer = await (await call(`api/pictures/${of}/${path}`, method, body)).json();
+  pictures[of].labelled = answer.row !== null;
   ahead.delete(of);
+  return answer;
 }
 
 async function undo() {
   await waiting;
   if (steps.length) { Object.assign(shown, steps.pop()); draw(); return; }
   if (!saves.length) { say("nothing to take back"); return; }
-  const { of, before } = saves.at(-1);
-  if (before) await call(`api/pictures/${of}/label`, "PUT",
-    label(before.markings, before.row.heading, before.row.drive || "", before.row.light || ""));
-  else await call(`api/pictures/${of}/label`, "DELETE");
+  const of = saves.at(-1);
+  await change(of, "label/undo", "POST", {}); // the server keeps the earlier rows
   saves.pop();
-  pictures[of].labelled = Boolean(before);
-  ahead.delete(of);
   await open(of);
 }
 
@@ -266,9 +262,8 @@ async function remove() {
   const of = number;
   if (!pictures[of].labelled) { await go(1); return; }
   if (!shown) return;
-  const before = await (await call(`api/pictures/${of}`)).json();
-  await call(`api/pictures/${of}/label`, "DELETE");
-  changed(of, false, before.source === "label" ? before : null);
+  await change(of, "label", "DELETE");
+  saves.push(of);
   await open(of);
 }
 

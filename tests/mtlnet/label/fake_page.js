@@ -1,13 +1,15 @@
 // Runs label.js with a fake page and a fake server of four pictures, presses keys, and prints what
 // the server received and what the page shows, as JSON.
 // Usage: node fake_page.js LABEL_JS LABELLED KEYS
-// LABELLED: numbers of the labelled pictures, with commas between them. KEYS: names of keys with
-// commas between them; they are pressed without a pause. "." waits until all requests are answered,
-// "fail" makes the next request fail, "show N" opens picture N, "drag" edits the picture.
+// LABELLED: numbers of the labelled pictures, with commas between them; "0-": the label has no lane.
+// KEYS: names of keys with commas between them; they are pressed without a pause. "." waits until
+// all requests are answered, "fail" makes the next request fail, "show N" opens picture N, "drag"
+// edits the picture.
 "use strict";
 const fs = require("fs"), vm = require("vm");
 const [file, labelled, keys] = process.argv.slice(2);
-const has = [0, 1, 2, 3].map((n) => labelled.split(",").includes(String(n)));
+const labels = [0, 1, 2, 3].map((n) => labelled.split(",").find((one) => one[0] === String(n)) || null);
+const earlier = labels.map(() => []); // for each picture the labels before each change
 const elements = {}, onKey = [], received = [];
 let pending = 0, failing = false;
 
@@ -18,21 +20,28 @@ const element = (id) => (elements[id] ||= {
   getContext: () => ink, getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {},
 });
 const pair = (value) => ({ left: structuredClone(value), right: structuredClone(value) });
+const row = (n) => (labels[n] ? { file: `${n}.png`, heading: "left" } : null);
 const picture = (n) => ({
   file: `${n}.png`, width: 100, height: 75, camera_pitch_deg: 0, note: "",
-  row: has[n] ? { heading: "left" } : null, source: has[n] ? "label" : "model",
+  row: row(n), source: labels[n] && !labels[n].endsWith("-") ? "label" : "model",
   markings: { ml: -1 - n / 10, mr: 2, angle: 0, curvature: 0, pitch_deg: 0 },
   lines: pair([[0, 0], [1, 75]]), handles: pair([[1, 70], [2, 60], [3, 50]]),
 });
 
 function answer(path, method, body) {
   const n = Number(/pictures\/(\d+)/.exec(path)?.[1]);
-  if (path === "api/pictures") return { pictures: has.map((one, i) => ({ file: `${i}.png`, labelled: one })) };
+  if (path === "api/pictures") return { pictures: labels.map((one, i) => ({ file: `${i}.png`, labelled: Boolean(one) })) };
   if (path.endsWith("fit")) return { ...picture(n), markings: { ...picture(n).markings, ml: -1.77 } };
   if (method === "GET") return picture(n);
-  received.push(method === "PUT" ? `PUT ${n} ${body.ml} ${body.heading}` : `DELETE ${n}`);
-  has[n] = method === "PUT";
-  return { file: `${n}.png` };
+  if (path.endsWith("undo")) {
+    received.push(`UNDO ${n}`);
+    labels[n] = earlier[n].pop();
+  } else {
+    received.push(method === "PUT" ? `PUT ${n} ${body.ml} ${body.heading}` : `DELETE ${n}`);
+    earlier[n].push(labels[n]);
+    labels[n] = method === "PUT" ? String(n) : null;
+  }
+  return { row: row(n) };
 }
 
 async function fetch(path, { method, body }) {
@@ -74,5 +83,5 @@ function drag() {
     else press(key);
   }
   await settle();
-  console.log(JSON.stringify({ ...page.found(), received, status: elements.status.textContent, stored: has }));
+  console.log(JSON.stringify({ ...page.found(), received, status: elements.status.textContent, stored: labels.map(Boolean) }));
 })();

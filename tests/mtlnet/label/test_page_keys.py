@@ -32,13 +32,20 @@ def press(labelled: str, keys: str) -> dict[str, Any]:
         ("", "Enter,Enter", ["PUT 0 -1 "], 1),
         ("", "Enter,ArrowRight", ["PUT 0 -1 "], 1),
         ("", "Enter,3", ["PUT 0 -1 "], 1),
-        ("", "Enter,ArrowRight,.,u", ["PUT 0 -1 ", "DELETE 0"], 0),
+        ("", "Enter,ArrowRight,.,u", ["PUT 0 -1 ", "UNDO 0"], 0),
         ("", "Enter,.,Enter", ["PUT 0 -1 ", "PUT 1 -1.1 "], 2),
         # The same holds for an undo and a removal.
-        ("", "Enter,.,u,ArrowRight", ["PUT 0 -1 ", "DELETE 0"], 0),
-        ("", "Enter,.,u,u", ["PUT 0 -1 ", "DELETE 0"], 0),
+        ("", "Enter,.,u,ArrowRight", ["PUT 0 -1 ", "UNDO 0"], 0),
+        ("", "Enter,.,u,u", ["PUT 0 -1 ", "UNDO 0"], 0),
         ("0,1", "show 0,x,ArrowRight", ["DELETE 0"], 0),
         ("0,1", "show 0,x,x", ["DELETE 0"], 0),
+        # An undo restores what the server had, also the label of a picture without a lane.
+        ("0", "show 0,Enter,.,u", ["PUT 0 -1 left", "UNDO 0"], 0),
+        ("0", "show 0,x,.,Enter,.,u,.,u", ["DELETE 0", "PUT 0 -1 ", "UNDO 0", "UNDO 0"], 0),
+        ("0-", "show 0,x,.,u", ["DELETE 0", "UNDO 0"], 0),
+        # The class of a label without a lane is shown, as that of any other label.
+        ("0-", "show 0,Enter,.,u", ["PUT 0 -1 left", "UNDO 0"], 0),
+        ("0-", "show 0,x,.,u,.,x,.,u", ["DELETE 0", "UNDO 0", "DELETE 0", "UNDO 0"], 0),
         # A picture that is not shown yet is not labelled, and its label is not removed.
         ("", "ArrowRight,Enter", [], 1),
         ("", "drag,ArrowRight,Enter", [], 1),
@@ -60,4 +67,4 @@ def test_a_failed_request_is_shown_and_can_be_repeated() -> None:
     found = press("", "Enter,.,fail,u")
     assert (found["received"], found["status"]) == (["PUT 0 -1 "], "no answer")
     found = press("", "Enter,.,fail,u,.,u")
-    assert found["received"] == ["PUT 0 -1 ", "DELETE 0"]
+    assert found["received"] == ["PUT 0 -1 ", "UNDO 0"]

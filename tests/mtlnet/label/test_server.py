@@ -12,7 +12,7 @@ from mtlnet.data.labels_file import read_cells, read_labels
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.geometry import marking_pixels
-from tests.mtlnet.label.conftest import TRUE, Site
+from tests.mtlnet.label.conftest import TRUE, Site, serve
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -37,8 +37,8 @@ def test_markings_are_dragged_saved_and_read_by_evaluate(site: Site) -> None:
     row = float(np.interp(-left[0][1], -line[:, 1], line[:, 0]))
     assert row == pytest.approx(left[0][0], abs=1.0)
     body = {**found["markings"], "drive": " one ", "light": "dusk"}
-    status, row_cells, _ = site.ask("PUT", "/api/pictures/2/label", body)
-    assert (status, row_cells["heading"], row_cells["drive"]) == (200, "straight", "one")
+    status, saved, _ = site.ask("PUT", "/api/pictures/2/label", body)
+    assert (status, saved["row"]["heading"], saved["row"]["drive"]) == (200, "straight", "one")
     pictures, labels = read_labels(site.folder / "labels.csv")
     assert [(p.file, p.light, p.pitch_deg) for p in pictures] == [("sub/2.png", "dusk", 0.5)]
     np.testing.assert_allclose(labels.distances[0, :2], [-1.5, 2.1], atol=1e-3)
@@ -243,3 +243,50 @@ def test_a_removed_label_can_be_restored_with_its_camera_and_columns(site: Site)
     assert {name: after[name] for name in ("camera", "light", "std_m", "r")} == {
         name: before[0][name] for name in ("camera", "light", "std_m", "r")
     }
+
+
+LANELESS = "1.png,,,,,,0.01,straight,city,6.0,0.2"
+"""The row of a picture that shows no lane, with all its cells."""
+
+
+@pytest.mark.parametrize(
+    "row", [LANELESS, "1.png,-1,2.6,-4.6,-1,2.6,0,?,,,", "1.png,,,?,?,?,0,left,,1.25,", None]
+)
+def test_undo_restores_the_earlier_row_exactly(site: Site, row: str | None) -> None:
+    table, path = site.folder / "labels.csv", "/api/pictures/0/label"
+    head = "file,ml,mr,l,m,r,angle,heading,drive,pitch_deg,std_m"
+    text = f"{head}\n10.png,-1,2.6,,,,0,?,,,0.1\n" + (f"{row}\n" if row else "")
+    table.write_text(text)
+    before = {cells["file"]: _filled(cells) for _, cells in read_cells(table)}
+    changes = [("PUT", LABEL), ("DELETE", None), ("PUT", {**LABEL, "drive": "", "heading": "?"})]
+    for changed in (changes[:1], changes[1:2], changes):
+        for method, body in changed:
+            assert site.ask(method, path, body)[0] == 200
+        for _ in changed:
+            status, found, _ = site.ask("POST", f"{path}/undo", {})
+            assert status == 200 or not row  # removing no label is no change
+        assert {cells["file"]: _filled(cells) for _, cells in read_cells(table)} == before
+        if row:
+            assert _filled(found["row"]) == before["1.png"]
+    status, told, _ = site.ask("POST", f"{path}/undo", {})
+    assert (status, told["detail"]) == (422, "no earlier label of 1.png is known")
+
+
+def test_the_label_of_a_picture_without_a_lane_is_pointed_out(site: Site) -> None:
+    head = "file,ml,mr,l,m,r,angle,heading,drive,pitch_deg,std_m"
+    (site.folder / "labels.csv").write_text(f"{head}\n{LANELESS}\n")
+    _, shown, _ = site.ask("GET", "/api/pictures/0")
+    assert (shown["source"], shown["row"]["heading"]) == ("usual", "straight")
+    assert "the label has no lane" in shown["note"]
+
+
+def test_a_message_about_a_file_name_that_is_not_utf8_can_be_sent(pictures: Path) -> None:
+    (pictures / "1.png").rename(pictures / os.fsdecode(b"0\xff.png"))
+    for site in serve(pictures, None):
+        status, told, _ = site.ask("POST", "/api/pictures/0/label/undo", {})
+        assert (status, told["detail"]) == (422, r"no earlier label of 0\udcff.png is known")
+
+
+def _filled(cells: dict[str, str]) -> dict[str, str]:
+    """Leave out the empty cells: which columns the table has depends on all its rows."""
+    return {name: text for name, text in cells.items() if text}
