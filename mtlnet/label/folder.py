@@ -5,6 +5,7 @@ and columns that the page does not show are kept. Only files inside the folder a
 """
 
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from threading import Lock
 
@@ -34,6 +35,10 @@ from trackfeatures.road_class import BEND_CURVATURE
 
 KEPT = ("drive", "light", "camera", "std_m", "std_rad")
 """Columns whose values stay when a label is saved, unless the page sends new ones."""
+
+
+class LabelChangedError(UserError):
+    """The label of a picture has another version than the label that was shown."""
 
 
 class LabelFolder:
@@ -159,21 +164,25 @@ class LabelFolder:
         curvature = float(row.get("curvature_1pm") or 0.0)
         return Markings(*sides, float(row["angle"]), curvature, camera.pitch_deg)
 
-    def save(self, number: int, markings: Markings, heading: str, texts: Cells) -> Cells:
+    def save(
+        self, number: int, markings: Markings, heading: str, texts: Cells, version: str = ""
+    ) -> Cells:
         """Write the label of picture `number` into `labels.csv`, and return its row of the file.
 
         `heading` is the class of the road; if it is empty, the class follows from the curvature of
         the markings, which must then be correct 20 m ahead. `texts`: the cells of the columns
         `drive` and `light`; a column that is missing in `texts` keeps its value. If the lane is at
         the same place as in the row's earlier label, the marking beyond the lane keeps its cell.
-        Raises UserError for a label out of range.
+        `version`: the `row_version` of the row that was shown; "" means that it is not checked.
+        Raises LabelChangedError if the row has another version, and UserError for a label out of
+        range.
         """
         if not heading:
             bend = "left" if markings.curvature > 0 else "right"
             heading = bend if abs(markings.curvature) >= BEND_CURVATURE else "straight"
         with self._lock:
-            name = self.files[number]
-            before, old = self.rows().get(name), self._last_row(name)
+            name, before = self._checked_row(number, version)
+            old = self._last_row(name)
             row = {
                 **{k: v for k, v in old.items() if k in KEPT},
                 **{k: v for k, v in texts.items() if k in ("drive", "light")},
@@ -189,25 +198,36 @@ class LabelFolder:
             self._earlier.setdefault(name, []).append(before)
         return row
 
-    def remove(self, number: int) -> None:
-        """Remove the label of a picture, if it has one."""
+    def remove(self, number: int, version: str = "") -> None:
+        """Remove the label of a picture, if it has one. `version`: as for `save`. Raises
+        LabelChangedError."""
         with self._lock:
-            name = self.files[number]
-            before = self.rows().get(name)
+            name, before = self._checked_row(number, version)
             if before is not None:
                 self._replace(name, None)
                 self._earlier.setdefault(name, []).append(before)
 
-    def undo(self, number: int) -> Cells | None:
+    def undo(self, number: int, version: str = "") -> Cells | None:
         """Undo the last saving or removal of a picture's label by this process, and return the
-        restored row; None if the picture had no label. Raises UserError if there is no change to
-        undo."""
+        restored row; None if the picture had no label. `version`: as for `save`. Raises
+        LabelChangedError, and UserError if there is no change to undo."""
         with self._lock:
-            name = self.files[number]
+            name, _ = self._checked_row(number, version)
             if not self._earlier.get(name):
                 raise UserError(f"no earlier label of {name} is known")
             self._replace(name, self._earlier[name][-1])
             return self._earlier[name].pop()
+
+    def _checked_row(self, number: int, version: str) -> tuple[str, Cells | None]:
+        """Return the file name of a picture and its row, None without one. Raises
+        LabelChangedError if the row does not have the version `version` (if this is not "")."""
+        name = self.files[number]
+        row = self.rows().get(name)
+        if version and version != row_version(row):
+            raise LabelChangedError(
+                f"the label of {name} has changed since it was shown; check the present one"
+            )
+        return name, row
 
     def _last_row(self, name: str) -> Cells:
         """Return the row of the picture `name`, or the last row that it had; else an empty dict."""
@@ -223,6 +243,17 @@ class LabelFolder:
             write_cells(self.folder / LABELS, [rows[k] for k in sorted(rows, key=natural_key)])
         else:
             (self.folder / LABELS).unlink(missing_ok=True)
+
+
+def row_version(row: Cells | None) -> str:
+    """Return a text that differs for rows with different cells; None is a missing row.
+
+    Empty cells do not count, because the columns of the file depend on its other rows.
+    """
+    if row is None:
+        return "none"
+    cells = sorted((name, text) for name, text in row.items() if text)
+    return sha256(repr(cells).encode()).hexdigest()[:16]
 
 
 def _distances(row: Cells) -> dict[str, float | None]:

@@ -28,7 +28,7 @@ from mtlnet.inference.engine import Engine
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
-from mtlnet.label.folder import LabelFolder
+from mtlnet.label.folder import LabelChangedError, LabelFolder, row_version
 from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
 from runtime.access import HostNames
 from runtime.files import locked_folder, name_as_text
@@ -116,7 +116,8 @@ class Labeller:
 
     def picture(self, number: int) -> dict[str, Any]:
         """Return what the page shows for picture `number`: name, size in px, row of `labels.csv`,
-        and the markings with their lines and handles in px (`shown`).
+        version of the row (`row_version`), and the markings with their lines and handles in px
+        (`shown`).
 
         The markings come from the label; without a label from the model's answer; if the model
         finds no lane either, they are the markings of a lane 3.6 m wide with the car in its middle.
@@ -138,6 +139,7 @@ class Labeller:
             "height": height,
             "camera_pitch_deg": camera.pitch_deg,
             "row": row_as_text(row),
+            "version": row_version(row),
             "source": "label" if label else "model" if answer else "usual",
             "note": note,
             **shown(camera, label or answer or usual),
@@ -218,22 +220,23 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
     def post_fit(number: int, drag: Drag) -> Response:
         return JSONResponse(labeller.fit(number, drag), headers=HEADERS)
 
-    def put_label(number: int, label: Label) -> Response:
+    def put_label(number: int, label: Label, version: str = "") -> Response:
         markings = Markings(label.ml, label.mr, label.angle, label.curvature, label.pitch_deg)
         texts = {"drive": label.drive, "light": label.light}
         given = {name: text.strip() for name, text in texts.items() if text is not None}
-        row = labeller.folder.save(number, markings, label.heading, given)
+        row = labeller.folder.save(number, markings, label.heading, given, version)
         return changed(row)
 
-    def delete_label(number: int) -> Response:
-        labeller.folder.remove(number)
+    def delete_label(number: int, version: str = "") -> Response:
+        labeller.folder.remove(number, version)
         return changed(None)
 
-    def post_undo(number: int) -> Response:
-        return changed(labeller.folder.undo(number))
+    def post_undo(number: int, version: str = "") -> Response:
+        return changed(labeller.folder.undo(number, version))
 
     def changed(row: Cells | None) -> Response:
-        return JSONResponse({"row": row_as_text(row)}, headers=HEADERS)
+        told = {"row": row_as_text(row), "version": row_version(row)}
+        return JSONResponse(told, headers=HEADERS)
 
     for work in (get_picture, get_image, post_fit, put_label, delete_label, post_undo):
         work.__annotations__["number"] = number_type
@@ -256,7 +259,8 @@ def _answer_errors(app: FastAPI, folder: Path) -> None:
 
     @app.exception_handler(UserError)
     async def refuse(_request: Any, error: UserError) -> Response:
-        return _refused(422, name_as_text(str(error).replace(f"{folder}/", "")))
+        status = 409 if isinstance(error, LabelChangedError) else 422
+        return _refused(status, name_as_text(str(error).replace(f"{folder}/", "")))
 
     @app.exception_handler(RequestValidationError)
     async def refuse_form(_request: Any, error: RequestValidationError) -> Response:

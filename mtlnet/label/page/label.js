@@ -21,7 +21,8 @@ async function call(path, method = "GET", body) {
   if (answer.status === 401) $("locked").hidden = false;
   if (!answer.ok) {
     const told = await answer.json().catch(() => ({}));
-    throw new Error(typeof told.detail === "string" ? told.detail : `the server answered ${answer.status}`);
+    const text = typeof told.detail === "string" ? told.detail : `the server answered ${answer.status}`;
+    throw Object.assign(new Error(text), { status: answer.status });
   }
   return answer;
 }
@@ -60,6 +61,7 @@ async function open(n) {
     const [data, bitmap] = await fetched(n);
     if (n !== number) return;
     shown = structuredClone(data);
+    pictures[n].labelled = shown.row !== null; // another page may have changed it
     image = bitmap;
     $("heading").value = shown.row ? shown.row.heading : "";
     if (shown.row) { $("drive").value = shown.row.drive || ""; $("light").value = shown.row.light || ""; }
@@ -234,37 +236,49 @@ async function save() {
   if (!shown) return;
   const of = number, texts = ["heading", "drive", "light"].map((id) => $(id).value);
   await waiting;
-  const { row } = await change(of, "label", "PUT", label(shown.markings, ...texts));
-  saves.push(of);
+  const { row, version } = await change(of, shown.version, "label", "PUT", label(shown.markings, ...texts));
+  saves.push({ of, version });
   document.body.dataset.saved = row.file;
   await open(Math.min(of + 1, pictures.length - 1));
   if (of === number) say("this was the last picture");
 }
 
-async function change(of, path, method, body) {
-  const answer = await (await call(`api/pictures/${of}/${path}`, method, body)).json();
-  pictures[of].labelled = answer.row !== null;
-  ahead.delete(of);
-  return answer;
+// Changes the label of picture `of`. The server answers 409 if the label does not have the version
+// `version` any more, because another page or program has changed it; then the picture is shown again.
+async function change(of, version, path, method, body) {
+  try {
+    const answer = await (await call(`api/pictures/${of}/${path}?version=${version}`, method, body)).json();
+    pictures[of].labelled = answer.row !== null;
+    ahead.delete(of);
+    return answer;
+  } catch (error) {
+    if (error.status === 409) {
+      saves = saves.filter((one) => one.of !== of); // the server refuses to undo these too
+      ahead.delete(of);
+      await open(of);
+    }
+    throw error;
+  }
 }
 
 async function undo() {
   await waiting;
   if (steps.length) { Object.assign(shown, steps.pop()); draw(); return; }
   if (!saves.length) { say("nothing to take back"); return; }
-  const of = saves.at(-1);
-  await change(of, "label/undo", "POST", {}); // the server keeps the earlier rows
+  const { of, version } = saves.at(-1);
+  await change(of, version, "label/undo", "POST", {}); // the server keeps the earlier rows
   saves.pop();
   await open(of);
 }
 
 async function remove() {
-  const of = number;
-  if (!pictures[of].labelled) { await go(1); return; }
-  if (!shown) return;
-  await change(of, "label", "DELETE");
-  saves.push(of);
-  await open(of);
+  const of = number, labelled = pictures[of].labelled;
+  // Without a label, the request checks that another page has not saved one.
+  if (shown) {
+    const { version } = await change(of, shown.version, "label", "DELETE");
+    if (labelled) saves.push({ of, version });
+  }
+  if (!labelled) await go(1); else if (shown) await open(of);
 }
 
 async function go(by) {

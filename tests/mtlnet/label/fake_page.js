@@ -4,14 +4,15 @@
 // LABELLED: numbers of the labelled pictures, with commas between them; "0-": the label has no lane.
 // KEYS: names of keys with commas between them; they are pressed without a pause. "." waits until
 // all requests are answered, "fail" makes the next request fail, "show N" opens picture N, "drag"
-// edits the picture.
+// edits the picture, "other N" is another page that labels picture N or removes its label.
 "use strict";
 const fs = require("fs"), vm = require("vm");
 const [file, labelled, keys] = process.argv.slice(2);
 const labels = [0, 1, 2, 3].map((n) => labelled.split(",").find((one) => one[0] === String(n)) || null);
+const versions = labels.map(() => 0);
 const earlier = labels.map(() => []); // for each picture the labels before each change
 const elements = {}, onKey = [], received = [];
-let pending = 0, failing = false;
+let changes = 0, pending = 0, failing = false;
 
 const ink = new Proxy({}, { get: (of, name) => of[name] ?? (() => {}), set: () => true });
 const element = (id) => (elements[id] ||= {
@@ -23,25 +24,32 @@ const pair = (value) => ({ left: structuredClone(value), right: structuredClone(
 const row = (n) => (labels[n] ? { file: `${n}.png`, heading: "left" } : null);
 const picture = (n) => ({
   file: `${n}.png`, width: 100, height: 75, camera_pitch_deg: 0, note: "",
-  row: row(n), source: labels[n] && !labels[n].endsWith("-") ? "label" : "model",
+  row: row(n), version: String(versions[n]), source: labels[n] && !labels[n].endsWith("-") ? "label" : "model",
   markings: { ml: -1 - n / 10, mr: 2, angle: 0, curvature: 0, pitch_deg: 0 },
   lines: pair([[0, 0], [1, 75]]), handles: pair([[1, 70], [2, 60], [3, 50]]),
 });
 
+function change(n, label) {
+  earlier[n].push([labels[n], versions[n]]);
+  labels[n] = label;
+  versions[n] = ++changes;
+}
+
 function answer(path, method, body) {
   const n = Number(/pictures\/(\d+)/.exec(path)?.[1]);
+  const version = /\?version=(.*)/.exec(path)?.[1];
   if (path === "api/pictures") return { pictures: labels.map((one, i) => ({ file: `${i}.png`, labelled: Boolean(one) })) };
   if (path.endsWith("fit")) return { ...picture(n), markings: { ...picture(n).markings, ml: -1.77 } };
   if (method === "GET") return picture(n);
-  if (path.endsWith("undo")) {
+  if (version !== String(versions[n])) return null;
+  if (path.includes("undo")) {
     received.push(`UNDO ${n}`);
-    labels[n] = earlier[n].pop();
-  } else {
+    [labels[n], versions[n]] = earlier[n].pop();
+  } else if (labels[n] || method === "PUT") {
     received.push(method === "PUT" ? `PUT ${n} ${body.ml} ${body.heading}` : `DELETE ${n}`);
-    earlier[n].push(labels[n]);
-    labels[n] = method === "PUT" ? String(n) : null;
+    change(n, method === "PUT" ? String(n) : null);
   }
-  return { row: row(n) };
+  return { row: row(n), version: String(versions[n]) };
 }
 
 async function fetch(path, { method, body }) {
@@ -51,6 +59,7 @@ async function fetch(path, { method, body }) {
   await new Promise((done) => setTimeout(done, 1));
   pending--;
   const told = ok ? answer(path, method, body && JSON.parse(body)) : { detail: "no answer" };
+  if (!told) return { ok: false, status: 409, json: async () => ({ detail: "changed since it was shown" }) };
   return { ok, status: ok ? 200 : 500, json: async () => told, blob: async () => ({}) };
 }
 
@@ -79,6 +88,7 @@ function drag() {
     if (key === ".") await settle();
     else if (key === "fail") failing = true;
     else if (key === "drag") drag();
+    else if (key.startsWith("other ")) change(Number(key.slice(6)), labels[key.slice(6)] ? null : key.slice(6));
     else if (key.startsWith("show ")) await page.show(Number(key.slice(5)));
     else press(key);
   }

@@ -75,6 +75,37 @@ def test_pictures_are_labelled_by_mouse_and_keys(
         assert not table.exists()
 
 
+def test_undo_restores_a_label_without_a_lane_and_a_second_page_keeps_a_label(
+    site: Site, tmp_path: Path
+) -> None:
+    table = site.folder / "labels.csv"
+    text = "file,ml,mr,l,m,r,angle,heading,drive\n1.png,,,,,,0.01,straight,city\n"
+    table.write_text(text)
+    url, status = f"http://127.0.0.1:{site.port}/", "document.getElementById('status').textContent"
+    with open_browser(tmp_path / "a", 800, 700) as a, open_browser(tmp_path / "b", 800, 700) as b:
+        for browser in (a, b):
+            browser.open(url)
+            browser.wait("document.body.dataset.ready === '1'")
+        b.press("ArrowLeft")
+        b.wait("document.body.dataset.ready === '0'")
+        b.press("Enter")
+        b.wait("document.body.dataset.ready === '1'")
+        assert table.read_text() != text
+        b.press("u")
+        b.wait("document.body.dataset.ready === '0'")
+        assert table.read_text() == text
+        # Page b has fetched picture 1 before page a saves its label.
+        a.press("Enter")
+        a.wait("document.body.dataset.ready === '2'")
+        saved = table.read_text()
+        b.press("ArrowRight")
+        b.wait("document.body.dataset.ready === '1'")
+        b.press("Enter")
+        b.wait(f"{status}.includes('has changed since it was shown')")
+        assert table.read_text() == saved
+        assert "✓" in b.evaluate("document.getElementById('name').textContent")
+
+
 def test_the_page_asks_for_the_token(guarded: Site, tmp_path: Path) -> None:
     url = f"http://127.0.0.1:{guarded.port}/"
     with open_browser(tmp_path / "p", 800, 700) as browser:

@@ -61,6 +61,48 @@ def test_a_key_acts_on_the_picture_that_was_shown(
     assert (found["number"], found["shown"]) == (number, f"{number}.png")
 
 
+CONFLICT = "changed since it was shown"
+
+
+@pytest.mark.parametrize(
+    ("labelled", "keys", "received", "shown"),
+    [
+        # Picture 1 was fetched in advance; then another page labels it or removes its label.
+        ("", "other 1,ArrowRight,.,Enter", [], "1.png"),
+        ("", "other 1,ArrowRight,.,x", [], "1.png"),
+        ("1", "show 0,.,other 1,ArrowRight,.,x", [], "1.png"),
+        ("", "other 1,ArrowRight,.,Enter,.,u", [], "1.png"),
+        # Another page changes a label that this page has saved.
+        ("", "Enter,.,other 0,u", ["PUT 0 -1 "], "0.png"),
+        ("", "Enter,.,Enter,.,other 1,u", ["PUT 0 -1 ", "PUT 1 -1.1 "], "1.png"),
+    ],
+)
+def test_the_label_of_another_page_is_shown_and_not_overwritten(
+    labelled: str, keys: str, received: list[str], shown: str
+) -> None:
+    found = press(labelled, keys)
+    assert (found["received"], found["shown"]) == (received, shown)
+    assert CONFLICT in found["status"] or keys.endswith("Enter,.,u")
+
+
+def test_after_a_conflict_the_present_label_can_be_changed() -> None:
+    found = press("", "other 1,ArrowRight,.,Enter,.,Enter,.,u")
+    assert found["received"] == ["PUT 1 -1.1 left", "UNDO 1"]
+    # The undo that is refused does not block the undo of earlier changes.
+    found = press("", "Enter,.,Enter,.,other 1,u,.,u")
+    assert found["received"] == ["PUT 0 -1 ", "PUT 1 -1.1 ", "UNDO 0"]
+    # A label that another page has saved can be removed by the next key.
+    assert press("", "other 1,ArrowRight,.,x,.,x")["received"] == ["DELETE 1"]
+
+
+def test_a_saving_without_changes_is_one_step_of_undo() -> None:
+    found = press("", "Enter,.,ArrowLeft,.,Enter,.,u,.,u")
+    assert found["received"] == ["PUT 0 -1 ", "PUT 0 -1 left", "UNDO 0", "UNDO 0"]
+    assert found["stored"][0] is False
+    # Where no label is to remove, nothing is to be undone.
+    assert press("", "Enter,.,x,.,u")["received"] == ["PUT 0 -1 ", "UNDO 0"]
+
+
 def test_a_failed_request_is_shown_and_can_be_repeated() -> None:
     found = press("0", "show 0,fail,Enter")
     assert (found["received"], found["status"], found["number"]) == ([], "no answer", 0)

@@ -272,6 +272,33 @@ def test_undo_restores_the_earlier_row_exactly(site: Site, row: str | None) -> N
     assert (status, told["detail"]) == (422, "no earlier label of 1.png is known")
 
 
+def test_a_label_that_has_changed_since_it_was_shown_is_not_overwritten(site: Site) -> None:
+    table, path = site.folder / "labels.csv", "/api/pictures/0/label"
+    none = site.ask("GET", "/api/pictures/0")[1]["version"]
+    saved = site.ask("PUT", f"{path}?version={none}", LABEL)[1]["version"]
+    assert site.ask("GET", "/api/pictures/0")[1]["version"] == saved != none
+    kept = table.read_bytes()
+    for method, where, body in (
+        ("PUT", path, {**LABEL, "ml": -1.0}),
+        ("DELETE", path, None),
+        ("POST", f"{path}/undo", {}),
+    ):
+        status, told, _ = site.ask(method, f"{where}?version={none}", body)
+        assert (status, told["detail"]) == (
+            409,
+            "the label of 1.png has changed since it was shown; check the present one",
+        )
+        assert table.read_bytes() == kept
+    # Another row, or a column that another row needs, does not change the version.
+    site.ask("PUT", "/api/pictures/1/label", {**LABEL, "light": "dusk"})
+    assert site.ask("GET", "/api/pictures/0")[1]["version"] == saved
+    table.write_text(table.read_text().replace("1.png,-1.500", "1.png,-1.400"))  # by hand
+    assert site.ask("POST", f"{path}/undo?version={saved}", {})[0] == 409
+    now = site.ask("GET", "/api/pictures/0")[1]["version"]
+    assert site.ask("DELETE", f"{path}?version={now}")[1] == {"row": None, "version": none}
+    assert site.ask("POST", f"{path}/undo?version={none}", {})[1]["version"] == now
+
+
 def test_the_label_of_a_picture_without_a_lane_is_pointed_out(site: Site) -> None:
     head = "file,ml,mr,l,m,r,angle,heading,drive,pitch_deg,std_m"
     (site.folder / "labels.csv").write_text(f"{head}\n{LANELESS}\n")
