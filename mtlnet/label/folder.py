@@ -4,7 +4,6 @@ Each change rewrites `labels.csv` atomically, starting from the current file: ro
 and columns that the page does not show are kept. Only files inside the folder are read.
 """
 
-from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from threading import Lock
@@ -136,11 +135,10 @@ class LabelFolder:
     def camera(self, number: int, width: int, height: int) -> CameraParameters:
         """Return the camera of picture `number`, resized to the picture's width and height (px).
 
-        Its pitch is the pitch in the picture's row, if the row has one. Raises UserError for a
-        faulty camera file, and for a camera with another aspect ratio.
+        Its pitch is the pitch in the camera file, not the pitch in the picture's row. Raises
+        UserError for a faulty camera file, and for a camera with another aspect ratio.
         """
-        row = self._last_row(self.files[number])
-        name = row.get("camera") or CAMERA_FILE
+        name = self._last_row(self.files[number]).get("camera") or CAMERA_FILE
         path = self.folder / name
         if not path.resolve().is_relative_to(self.folder):
             raise UserError(f"the camera {name} leads out of the folder")
@@ -150,13 +148,11 @@ class LabelFolder:
                 f"{self.files[number]} is {width} x {height} px, its camera gives {camera.width} x "
                 f"{camera.height}: label the camera's whole pictures, at any size"
             )
-        if row.get("pitch_deg"):
-            camera = replace(camera, pitch_deg=float(row["pitch_deg"]))
         return camera.resized(width, height)
 
     def markings(self, number: int, camera: CameraParameters) -> Markings | None:
-        """Return the label of picture `number`, which `camera` took; None if the picture has no
-        label, or if its label does not have the distances to both markings of a lane."""
+        """Return the label of picture `number`, with the pitch of `camera`; None if the picture has
+        no label, or if its label does not have the distances to both markings of a lane."""
         row = self.rows().get(self.files[number], {})
         sides = lane_sides(_distances(row))
         if sides is None:

@@ -13,9 +13,10 @@ import filecmp
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from mtlnet.data.labels_file import (
@@ -84,6 +85,10 @@ def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> d
         except (UserError, ValueError) as error:
             raise UserError(f"{table}, line {line}: {error}") from None
         found.append((camera, cells))
+    pitches: dict[CameraParameters, list[float]] = {}
+    for camera, cells in found:
+        given = [float(cells["pitch_deg"])] if "pitch_deg" in cells else []
+        pitches.setdefault(camera, []).extend(given)
     cameras: dict[CameraParameters, str] = {}
     for camera, cells in found:
         source, target = table.parent / cells["file"], folder / cells["file"]
@@ -91,7 +96,7 @@ def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> d
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
         if camera not in cameras:
-            cameras[camera] = _write_camera(folder, camera)
+            cameras[camera] = _write_camera(folder, camera, pitches[camera])
         cells["camera"] = cameras[camera]
     write_cells(folder / LABELS, [cells for _, cells in found])
     return {"folder": str(folder), "pictures": len(found), "cameras": len(cameras)}
@@ -181,12 +186,14 @@ def _number(row: dict[str, str], name: str) -> float:
     return value
 
 
-def _write_camera(folder: Path, camera: CameraParameters) -> str:
-    """Write the file of a camera; returns its name within `folder`, which no other file has."""
+def _write_camera(folder: Path, camera: CameraParameters, pitches_deg: Sequence[float]) -> str:
+    """Write the file of a camera, with the median of the pitches of its pictures (degrees) or, if
+    none is known, a pitch of 0; returns its name within `folder`, which no other file has."""
     base = f"{CAMERAS}/{camera.width}x{camera.height}-{camera.fov_y_deg:g}deg"
     name, number = f"{base}.yaml", 2
     while (folder / name).exists():  # for example of a camera that differs only in its height
         name, number = f"{base}-{number}.yaml", number + 1
     (folder / CAMERAS).mkdir(exist_ok=True)
-    write_camera(folder / name, camera, "The pitch of each picture is in labels.csv.")
+    comment = "pitch_deg is the median of the pitches of the pictures in labels.csv, 0 if none."
+    write_camera(folder / name, replace(camera, pitch_deg=median(pitches_deg or [0.0])), comment)
     return name

@@ -7,7 +7,7 @@ every request, and its token if one is required, are checked by the rules of the
 
 import sys
 from collections.abc import Awaitable, Callable, MutableMapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from hmac import compare_digest
 from pathlib import Path
 from threading import Lock
@@ -122,12 +122,15 @@ class Labeller:
         The markings come from the label; without a label from the model's answer; if the model
         finds no lane either, they are the markings of a lane 3.6 m wide with the car in its middle.
         `source` states which of these three cases applies: "label", "model" or "usual". A label
-        without a lane counts as no label here, and `note` describes this.
+        without a lane counts as no label here, and `note` describes this. `camera_pitch_deg` is the
+        pitch in the camera file; the markings have the pitch in the row, if the row has one.
         """
         image = self.folder.picture(number)
         height, width = image.shape[:2]
-        camera = self.folder.camera(number, width, height)
+        in_file = self.folder.camera(number, width, height)
         row = self.folder.rows().get(self.folder.files[number])
+        pitch = (row or {}).get("pitch_deg")
+        camera = replace(in_file, pitch_deg=float(pitch)) if pitch else in_file
         label = self.folder.markings(number, camera)
         answer, note = (None, "") if label else self._answer(image, camera)
         if row is not None and label is None:
@@ -137,7 +140,7 @@ class Labeller:
             "file": name_as_text(self.folder.files[number]),
             "width": width,
             "height": height,
-            "camera_pitch_deg": camera.pitch_deg,
+            "camera_pitch_deg": in_file.pitch_deg,
             "row": row_as_text(row),
             "version": row_version(row),
             "source": "label" if label else "model" if answer else "usual",

@@ -9,6 +9,7 @@ import pytest
 
 from mtlnet.data.custom_images import open_custom_images
 from mtlnet.data.labels_file import read_labels
+from mtlnet.label.folder import LabelFolder
 from mtlnet.label.import_table import import_labels, parse_label_std
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
@@ -53,6 +54,26 @@ def test_a_table_becomes_labels_and_cameras(tmp_path: Path) -> None:
     assert heights == pytest.approx([1.22, 1.5])
     with pytest.raises(UserError, match=r"labels\.csv exists; give a new folder"):
         import_labels(path, tmp_path / "mine")
+
+
+def test_a_camera_file_has_the_median_pitch_of_its_pictures(tmp_path: Path) -> None:
+    """The label page keeps this pitch, and pictures without a pitch have it."""
+    (tmp_path / "theirs").mkdir()
+    for name in ("c.png", "d.png", "e.png"):
+        cv2.imwrite(str(tmp_path / "theirs" / name), np.full((360, 640, 3), 90, np.uint8))
+    path = table(
+        tmp_path / "theirs",
+        "a.png,1.7,-1.9,0,40,1.22,,,0,500,189.5,",
+        "b.png,1.7,-1.9,0,40,1.22,,,0,500,169.5,",
+        "c.png,1.7,-1.9,0,40,1.22,,,0,500,159.5,",
+        "d.png,1.7,-1.9,0,40,1.22,,,0,,,",
+        "e.png,1.7,-1.9,0,40,1.5,,,0,,,",
+    )
+    assert import_labels(path, tmp_path / "mine")["cameras"] == 2
+    folder = LabelFolder(tmp_path / "mine", None, CameraParameters())
+    pitches = [folder.camera(number, 640, 360).pitch_deg for number in range(5)]
+    median = np.degrees(np.arctan(10 / 500))
+    assert pitches == pytest.approx([median] * 4 + [0.0], abs=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -299,6 +299,22 @@ def test_a_label_that_has_changed_since_it_was_shown_is_not_overwritten(site: Si
     assert site.ask("POST", f"{path}/undo?version={none}", {})[1]["version"] == now
 
 
+def test_the_kept_pitch_is_that_of_the_camera_file(site: Site) -> None:
+    camera = site.folder / "camera.yaml"
+    camera.write_text(camera.read_text().replace("}", ", pitch_deg: 1}"))
+    (site.folder / "labels.csv").write_text(
+        "file,ml,mr,l,m,r,angle,heading,pitch_deg\n1.png,-1.5,2.1,,,,0.03,?,6\n10.png,,,,,,0,?,5\n"
+    )
+    shown = [site.ask("GET", f"/api/pictures/{number}")[1] for number in range(3)]
+    assert [each["camera_pitch_deg"] for each in shown] == [1.0, 1.0, 1.0]
+    # What is drawn has the pitch of the row, also without a lane in the label.
+    assert [each["markings"]["pitch_deg"] for each in shown] == [6.0, 5.0, 1.0]
+    site.ask("DELETE", "/api/pictures/0/label")
+    _, removed, _ = site.ask("GET", "/api/pictures/0")
+    assert (removed["row"], removed["camera_pitch_deg"]) == (None, 1.0)
+    assert removed["markings"]["pitch_deg"] == 1.0
+
+
 def test_the_label_of_a_picture_without_a_lane_is_pointed_out(site: Site) -> None:
     head = "file,ml,mr,l,m,r,angle,heading,drive,pitch_deg,std_m"
     (site.folder / "labels.csv").write_text(f"{head}\n{LANELESS}\n")
