@@ -42,7 +42,8 @@ def train(config: TrainConfig, as_json: bool, given: Container[str]) -> None:
 
 
 def _continued(config: TrainConfig, given: Container[str]) -> TrainConfig:
-    """Return the options stored in the folder `config.out`, with the threads of `config`.
+    """Return the options stored in the folder `config.out`; a given number of threads replaces the
+    stored one.
 
     `given`: names of the options that the user has given. Raises UserError if another of these
     options differs from the stored option.
@@ -57,4 +58,4 @@ def _continued(config: TrainConfig, given: Container[str]) -> TrainConfig:
                 f"{config.out} was started with {name} {getattr(stored, name)}, now {value} is "
                 "given; leave it out to continue, or start another training with another --out"
             )
-    return replace(stored, threads=config.threads)
+    return replace(stored, threads=config.threads) if "threads" in given else stored

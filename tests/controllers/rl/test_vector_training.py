@@ -16,6 +16,7 @@ from controllers.rl import vector_training
 from controllers.rl.cars import Step
 from controllers.rl.config import ALGORITHMS, TrainConfig, resolve
 from controllers.rl.off_policy import OffPolicy
+from controllers.rl.run_folder import prepare_folder
 from controllers.rl.training import train
 from tests.typed import error_line, typed
 from trackfeatures.errors import UserError
@@ -158,6 +159,23 @@ def test_the_command_continues_with_the_stored_options(tmp_path: Path) -> None:
     done = typed("controllers", "train", "--out", out, "--resume", "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["steps"] == 3 * UPDATE
+
+
+@pytest.mark.parametrize(("given", "threads"), [((), 8), (("--threads", "2"), 2)])
+def test_resume_keeps_the_threads_of_the_start_unless_others_are_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...], threads: int
+) -> None:
+    prepare_folder(resolve(short(tmp_path, threads=8)))
+    configs: list[TrainConfig] = []
+
+    def stored(config: TrainConfig, report: object) -> dict[str, Any]:
+        configs.append(config)
+        return {"best_score_per_step": 0.0, "best_step": 0}
+
+    monkeypatch.setattr("controllers.rl.training.train", stored)
+    done = typed("controllers", "train", "--out", tmp_path, "--resume", *given)
+    assert done.returncode == 0, done.stderr
+    assert [config.threads for config in configs] == [threads]
 
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
