@@ -1,12 +1,13 @@
 """The folder of a training: its options, its curves, and the best actor.
 
-`config.json` has the options. `curve.csv` and `tensorboard/` (if the package is installed) have a
-point for each evaluation. `actor.safetensors` and `actor.json` contain the best actor.
+`config.json` has the options and the hashes of the roads. `curve.csv` and `tensorboard/` (if the
+package is installed) have a point for each evaluation. `actor.safetensors` and `actor.json` contain
+the best actor.
 """
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,11 +18,15 @@ from controllers.laws.actor import Actor, save_actor
 from controllers.rl.checkpoint import Learner, Progress, load_checkpoint, save_checkpoint
 from controllers.rl.config import TrainConfig, resolve
 from runtime.files import atomic_write, write_json
+from simulator.track.geometry import Track
 from trackfeatures.errors import UserError
 
 if TYPE_CHECKING:
     from runtime.tensorboard import TensorBoardWriter
 
+ROADS = "roads"
+"""Key of `config.json`: the hash (`Track.driving_hash`) of each track of the training, by name.
+Trainings of earlier versions do not have this key."""
 CONFIG, CURVE, TENSORBOARD = "config.json", "curve.csv", "tensorboard"
 COLUMNS = ("step", "seconds", "episodes", "loss", "score_per_step", "mean_abs_d_m", "max_abs_d_m")
 UNCOMPARED = ("out", "threads", "resume")
@@ -42,13 +47,14 @@ def stored_config(run: Path) -> TrainConfig:
     return replace(_read(run / CONFIG), out=run)
 
 
-def prepare_folder(config: TrainConfig) -> None:
-    """Make the folder of the run. If it contains a run already, raise UserError unless this run has
-    the same configuration."""
+def prepare_folder(config: TrainConfig, tracks: Iterable[Track]) -> None:
+    """Make the folder of a run on `tracks`. If it contains a run already, raise UserError unless
+    this run has the same configuration and the same roads."""
     path = config.out / CONFIG
+    roads = {track.name: track.driving_hash for track in tracks}
     if not path.exists():
         config.out.mkdir(parents=True, exist_ok=True)
-        write_json(path, _content(config))
+        write_json(path, _content(config) | {ROADS: roads})
         return
     found, now = _content(_read(path)), _content(config)
     changed = [name for name in now if name not in UNCOMPARED and found[name] != now[name]]
@@ -56,6 +62,24 @@ def prepare_folder(config: TrainConfig) -> None:
         raise UserError(
             f"{config.out} holds a training with another {', '.join(changed)}; give another "
             "--out, or --resume to continue it"
+        )
+    _require_same_roads(path, roads)
+
+
+def _require_same_roads(path: Path, roads: dict[str, str]) -> None:
+    """Raise UserError if the `config.json` at `path` has hashes of roads that differ from `roads`
+    (hashes by name)."""
+    stored = json.loads(path.read_text(encoding="utf-8")).get(ROADS, roads)
+    names = sorted(name for name in {**stored, **roads} if stored.get(name) != roads.get(name))
+    if names:
+        name, more = names[0], f" and {len(names) - 1} more" if len(names) > 1 else ""
+        if name not in stored:
+            what = "was not there"
+        else:
+            what = "has changed" if name in roads else "is missing now"
+        raise UserError(
+            f"{path.parent} was started on other roads: track {name} {what}{more}; restore "
+            "the tracks ($TORCS_TRACKS, --tracks-dir) or give another --out"
         )
 
 

@@ -73,7 +73,8 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
         "driverview/LateralControl-v0", track=config.track, disable_env_checker=True, **options
     )
     try:
-        prepare_folder(config)
+        world: World = env.unwrapped.world  # type: ignore[attr-defined]
+        prepare_folder(config, [world.road.track])
         with locked_folder(config.out):
             return _Training(config, settings, env, report).run()
     finally:

@@ -73,7 +73,7 @@ def train_vector(
     learner = _learner(config, settings, definition)
     training = _Training(config, settings, definition, learner, report)
     try:
-        prepare_folder(config)
+        prepare_folder(config, training.tracks)
         with locked_folder(config.out):
             return training.run()
     finally:
@@ -121,6 +121,7 @@ class _Training:
         found = (
             list_tracks(folder) if self._track == ALL_TRACKS else [find_track(self._track, folder)]
         )
+        self.tracks = found
         whole = self._track == ALL_TRACKS
         self._half_width_m = HALF_WIDTH_M if whole else 0.5 * found[0].width
         shared: dict[str, Any] = {

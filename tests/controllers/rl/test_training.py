@@ -1,6 +1,7 @@
 """Training: exploration, replay, a resumed training that gives the same bits, the command."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from controllers.laws.actor_state import PAPER, STACKED, STATES
 from controllers.rl.agent import Agent, Replay
 from controllers.rl.config import ALGORITHMS, TrainConfig, exploration_share
 from controllers.rl.training import train
+from simulator.track.catalogue import OWN_TRACKS
 from tests.typed import error_line, typed
 from trackfeatures.errors import UserError
 
@@ -179,6 +181,23 @@ def test_a_run_without_a_stored_reward_is_continued(tmp_path: Path) -> None:
     del content["reward"]
     path.write_text(json.dumps(content))
     assert train(short(tmp_path, steps=200))["steps"] == 200
+
+
+def test_a_training_on_a_changed_track_is_not_continued(tmp_path: Path) -> None:
+    track, out = tmp_path / "mine.toml", tmp_path / "run"
+    text = (OWN_TRACKS / "oval.toml").read_text()
+    track.write_text(text)
+    config = short(out, track=str(track), steps=20, evaluate_every=20)
+    train(config)
+    track.write_text(re.sub(r'^surface = ".*"$', 'surface = "gravel"', text, flags=re.M))
+    for resume in (False, True):
+        with pytest.raises(UserError, match="was started on other roads: track mine has changed"):
+            train(replace(config, resume=resume))
+    path = out / "config.json"
+    content = json.loads(path.read_text())
+    assert content.pop("roads").keys() == {"mine"}
+    path.write_text(json.dumps(content))  # as earlier versions wrote it
+    train(config)
 
 
 def test_another_seed_gives_another_actor(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from controllers.rl.config import ALGORITHMS, TrainConfig, resolve
 from controllers.rl.off_policy import OffPolicy
 from controllers.rl.run_folder import prepare_folder
 from controllers.rl.training import train
+from simulator.track.catalogue import find_track
 from tests.typed import error_line, typed
 from trackfeatures.errors import UserError
 
@@ -161,11 +162,31 @@ def test_the_command_continues_with_the_stored_options(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["steps"] == 3 * UPDATE
 
 
+def test_a_training_on_all_tracks_is_not_continued_on_other_roads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracks = [find_track("oval"), find_track("town")]
+    monkeypatch.setattr(vector_training, "list_tracks", lambda folder: tracks)
+    config = short(tmp_path, track="all", steps=UPDATE)
+    train(config)
+    roads = {track.name: track.driving_hash for track in tracks}
+    assert json.loads((tmp_path / "config.json").read_text())["roads"] == roads
+    train(config)
+    for others, message in (
+        (["oval"], f"^{tmp_path} was started on other roads: track town is missing now; restore"),
+        (["oval", "town", "circuit"], "track circuit was not there; restore"),
+        (["circuit"], "track circuit was not there and 2 more; restore"),
+    ):
+        tracks[:] = map(find_track, others)
+        with pytest.raises(UserError, match=message):
+            train(config)
+
+
 @pytest.mark.parametrize(("given", "threads"), [((), 8), (("--threads", "2"), 2)])
 def test_resume_keeps_the_threads_of_the_start_unless_others_are_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...], threads: int
 ) -> None:
-    prepare_folder(resolve(short(tmp_path, threads=8)))
+    prepare_folder(resolve(short(tmp_path, threads=8)), [])
     configs: list[TrainConfig] = []
 
     def stored(config: TrainConfig, report: object) -> dict[str, Any]:
