@@ -19,10 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers import laws
 from controllers.interface import Controller, LoopConfig, Observation, Observations
-from controllers.laws.actor import is_actor
+from controllers.laws.actor import CARD, SHIPPED, WEIGHTS, is_actor
 from trackfeatures.errors import UserError
 
+LAWS = Path(laws.__file__).parent
 OWN_FILE = "controller_of_"
 """Prefix of the module name of a user's file, so that the file replaces no other module in
 `sys.modules`."""
@@ -131,8 +133,42 @@ def make_controller(
         ) from error
 
 
+def controller_code(name: str) -> bytes:
+    """Return the content of the files that determine how the controller `name` steers (a name for
+    `make_controller`). Raises UserError for a user's class that cannot be imported."""
+    return b"".join(file.read_bytes() for file in _files_of(name))
+
+
+def _files_of(name: str) -> list[Path]:
+    """Return the paths of a controller's files. For a controller of this project and a trained
+    actor, these are all modules of `controllers.laws` and the actor's files. For a user's class,
+    these are the module in `name` and the modules that define the class and its base classes."""
+    folder = SHIPPED / name if name in CONTROLLERS else Path(name)
+    if name in CONTROLLERS or is_actor(folder):
+        actor = [folder / part for part in (CARD, WEIGHTS)]
+        return [*sorted(LAWS.glob("*.py")), *filter(Path.is_file, actor)]
+    module, found = _own_class(name)
+    modules = [module, *(sys.modules.get(base.__module__) for base in found.__mro__)]
+    files = [getattr(one, "__file__", None) for one in modules]
+    return [Path(file) for file in dict.fromkeys(files) if file is not None]
+
+
 def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
     """Make a controller of the user's class `name`, MODULE:CLASS or FILE.py:CLASS."""
+    place, _, class_name = name.rpartition(":")
+    _, found = _own_class(name)
+    try:
+        return _OwnController(f"the class {class_name} of {place}", found(**(parameters or {})))
+    except Exception as error:  # a user's class may raise anything
+        raise UserError(
+            f"the class {class_name} of {place} cannot be made: {_line(error)}; give every "
+            "argument a default"
+        ) from error
+
+
+def _own_class(name: str) -> tuple[ModuleType, type]:
+    """Import the user's class `name`, MODULE:CLASS or FILE.py:CLASS; return this module and the
+    class."""
     place, _, class_name = name.rpartition(":")
     module = _load_file(Path(place)) if place.endswith(".py") else _import(place)
     found = getattr(module, class_name, None)
@@ -143,13 +179,7 @@ def _make_own(name: str, parameters: Mapping[str, float] | None) -> Controller:
             f"the class {class_name} of {place} has no method update(observation); it returns the "
             "steering action in [-1, 1], left positive"
         )
-    try:
-        return _OwnController(f"the class {class_name} of {place}", found(**(parameters or {})))
-    except Exception as error:  # a user's class may raise anything
-        raise UserError(
-            f"the class {class_name} of {place} cannot be made: {_line(error)}; give every "
-            "argument a default"
-        ) from error
+    return module, found
 
 
 class _OwnController:

@@ -6,27 +6,30 @@ Drives with exact states (perception `truth`) are made in batches if their contr
 file is made again only if its controller, tuned parameters, road or model has changed.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from controllers import laws
+from controllers.compare.cells import Cell, cells
 from controllers.compare.config import CompareConfig
 from controllers.compare.curves import CurveRecorder, curves_of
+from controllers.compare.inputs import (
+    fingerprints,
+    parameters_of,
+    require_parameters,
+    with_resolved_model,
+)
 from controllers.drive.config import DriveConfig
-from controllers.drive.disturbance import DISTURBANCES, UNDISTURBED
+from controllers.drive.disturbance import DISTURBANCES
 from controllers.drive.many import Outcome, Task, can_join, drive_many
-from controllers.drive.run import GRID_SHARE, drive, read_parameters
+from controllers.drive.run import GRID_SHARE, drive
 from controllers.interface import LoopConfig
-from controllers.laws.actor import CARD, SHIPPED, WEIGHTS, is_actor
-from controllers.perception.sources import ServiceModel, check_perception
-from controllers.registry import CONTROLLERS, make_controller
+from controllers.perception.sources import check_perception
+from controllers.registry import make_controller
 from runtime.files import locked_folder, write_json
 from simulator.camera import check_light
 from simulator.track.catalogue import find_track
@@ -35,7 +38,6 @@ from trackfeatures.errors import UserError
 
 VERSION = 3
 """Version of `results.json`."""
-LAWS = Path(laws.__file__).parent
 RESULTS, REPORT = "results.json", "report.html"
 SETTINGS = ("steps", "start_d", "latency_ms", "drop", "model", "views", "light")
 """Names of the options of a comparison that are equal for all drives in a `results.json`."""
@@ -50,47 +52,6 @@ Driven = dict[str, Any] | UserError
 """The result of a drive with its curves, or the error of a drive without a result."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """The settings that identify one drive of a comparison."""
-
-    track: str
-    controller: str
-    perception: str
-    disturbance: str
-    seed: int
-
-    @property
-    def name(self) -> str:
-        changed = "" if self.disturbance == UNDISTURBED else f", {self.disturbance}"
-        return f"{self.controller} on {self.track}, {self.perception}{changed}, seed {self.seed}"
-
-
-def cells(config: CompareConfig) -> list[Cell]:
-    """Return the cells of all drives, ordered by track. Raises UserError if there is no seed, or no
-    name in an option that lists tracks, perceptions or controllers."""
-    if config.seeds < 1:
-        raise UserError(f"{config.seeds} seeds; give 1 or more")
-    disturbances = list(DISTURBANCES) if config.disturb else [UNDISTURBED]
-    return [
-        Cell(track, controller, perception, disturbance, seed)
-        for track in names(config.tracks, "tracks")
-        for perception in names(config.perceptions, "perceptions")
-        for disturbance in disturbances
-        for controller in names(config.controllers, "controllers")
-        for seed in range(config.seeds)
-    ]
-
-
-def names(text: str, what: str) -> list[str]:
-    """Return the names in `text`, separated by commas, without repetition. Raises UserError if
-    there is no name; `what` is the name of the option."""
-    found = list(dict.fromkeys(filter(None, (name.strip() for name in text.split(",")))))
-    if not found:
-        raise UserError(f"--{what} names nothing; give names with commas between them")
-    return found
-
-
 def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str, Any]:
     """Make the drives whose results are missing in `config.out`; return the content of
     `results.json`, with only the drives of this comparison.
@@ -100,7 +61,9 @@ def compare(config: CompareConfig, progress: Progress | None = None) -> dict[str
     drive if a car touched something; the results of all other drives are then in `results.json`.
     """
     todo = cells(config)
-    for controller in dict.fromkeys(cell.controller for cell in todo):
+    controllers = list(dict.fromkeys(cell.controller for cell in todo))
+    require_parameters(config, controllers)
+    for controller in controllers:
         make_controller(controller, LoopConfig(0.05), parameters_of(config, controller))
     for track in dict.fromkeys(cell.track for cell in todo):
         find_track(track, config.tracks_dir)
@@ -123,6 +86,7 @@ def _drive_missing(
     return the content of `results.json`."""
     path = config.out / RESULTS
     content = read_results(path, config)
+    config = with_resolved_model(config, todo)
     known = {_key(entry): entry for entry in content["drives"]}
     codes = fingerprints(config, todo)
     missing = [cell for cell in todo if known.get(cell, {}).get("code") != codes[cell]]
@@ -244,75 +208,6 @@ def drive_cell(cell: Cell, task: Task, progress: Callable[[int, int], None]) -> 
         return error
     curves = {"curves": recorder.curves()} if cell.seed == 0 else {}
     return {"result": result.as_json()} | curves
-
-
-def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
-    """Read a controller's parameters in `config.parameters`; {} if they are not in this file."""
-    if config.parameters is None:
-        return {}
-    try:
-        tuned = json.loads(config.parameters.read_text())["controllers"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{config.parameters} is no file of `controllers tune`") from error
-    return read_parameters(config.parameters, controller) if controller in tuned else {}
-
-
-def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
-    """Return, for each drive, a hash of the inputs that its cell does not contain: the tuned
-    parameters, the road, the controller's files, and the weights of the model (for a service, also
-    the precision of its answers and its number of views)."""
-    tracks = {
-        name: find_track(name, config.tracks_dir).driving_hash.encode()
-        for name in dict.fromkeys(cell.track for cell in todo)
-    }
-    parameters, files = {}, {}
-    for name in dict.fromkeys(cell.controller for cell in todo):
-        parameters[name] = json.dumps(parameters_of(config, name)).encode()
-        files[name] = b"".join(file.read_bytes() for file in _files_of(name))
-    models = {
-        name: _model_of(config, name).encode()
-        for name in dict.fromkeys(cell.perception for cell in todo)
-    }
-    codes = {}
-    for cell in todo:
-        used = parameters[cell.controller], tracks[cell.track], files[cell.controller]
-        codes[cell] = hashlib.sha256(b"".join((*used, models[cell.perception]))).hexdigest()[:16]
-    return codes
-
-
-def _model_of(config: CompareConfig, perception: str) -> str:
-    """Return the hash of the weights of the perception's model; "" for `truth` (no model)."""
-    if perception == "truth":
-        return ""
-    return model_hash(config.model) if perception == "model" else service_identity(perception)
-
-
-def _files_of(controller: str) -> list[Path]:
-    """Return the paths of a controller's files: all modules of `controllers.laws` and its trained
-    actor, if it has one, for a controller of this project; the files of a trained actor; or the
-    file of a user's class."""
-    if controller in CONTROLLERS:
-        actor = [SHIPPED / controller / name for name in (CARD, WEIGHTS)]
-        return [*sorted(LAWS.glob("*.py")), *filter(Path.is_file, actor)]
-    if is_actor(Path(controller)):
-        return [Path(controller) / name for name in (CARD, WEIGHTS)]
-    place = controller.rpartition(":")[0]
-    return [Path(place if place.endswith(".py") else str(import_module(place).__file__))]
-
-
-def model_hash(run: str) -> str:
-    """Return the SHA-256 of the weights of the run `run`, which is a folder or a name."""
-    from mtlnet.inference.model_card import read_card, resolve_run
-
-    return read_card(resolve_run(run)).model_hash
-
-
-def service_identity(url: str) -> str:
-    """Return what determines the answers of the service at `url` (`ServiceModel.identity`). Raises
-    UserError if it does not answer."""
-    service = ServiceModel(url)
-    service.close()
-    return service.identity
 
 
 def read_results(path: Path, config: CompareConfig) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from controllers.compare.cells import names
 from controllers.compare.config import TuneConfig
-from controllers.compare.run import names
 from controllers.drive.closed_loop import check_reward
 from controllers.drive.config import DriveConfig
 from controllers.drive.disturbance import find_disturbance
@@ -149,8 +149,9 @@ def _read(path: Path, config: TuneConfig) -> dict[str, Any]:
         return {"version": VERSION, "settings": settings, "controllers": {}}
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-        found, version, _ = content["settings"], content["version"], content["controllers"]
-    except (ValueError, KeyError, TypeError) as error:
+        found, version = content["settings"], content["version"]
+        _ = content["controllers"].items()
+    except (AttributeError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} holds no tuning ({error!r}); give another --out") from error
     if version != VERSION or found != settings:
         raise UserError(f"{path} was made with other settings, {found}; give another --out")

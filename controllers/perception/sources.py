@@ -78,6 +78,22 @@ class LocalModel:
         """Do nothing: the model has no connection."""
 
 
+def model_identity(run: str) -> str:
+    """Return what determines the answers of the `LocalModel` of the run `run` (a folder or a name)
+    to an image, as JSON: the hashes of the model's files that its card states, its camera, and the
+    precision on this processor, for int8 with the hashes of the int8 graph."""
+    from mtlnet.inference.engine import INT8, default_precision, read_export
+    from mtlnet.inference.model_card import read_card, resolve_run
+
+    folder = resolve_run(run)
+    card = read_card(folder)
+    precision = default_precision(folder, card)
+    export = read_export(folder / INT8) if precision == "int8" else None
+    return json.dumps(
+        [card.files, card.camera.as_dict(), precision, export and export["files"]], sort_keys=True
+    )
+
+
 class ServiceModel:
     """The model of the perception service at `url`; the path may end with /features.
 
@@ -92,10 +108,10 @@ class ServiceModel:
         card = self._client.model()
         tf.require_version(str(card.get("definitions_version")), f"the service at {url}")
         self.camera: CameraParameters = parse_camera(card.get("camera"))
-        known = ("model_hash", "engine", "precision", "views")
+        known = ("files", "camera", "engine", "precision", "views")
         self.identity = json.dumps({name: card.get(name) for name in known})
-        """Hash of the weights, library, precision and number of views with which the service
-        computes its answers, as JSON."""
+        """Hashes of the model's files, its camera, and the library, precision and number of views
+        with which the service computes its answers, as JSON."""
 
     def predict(self, image: Image) -> dict[str, Any]:
         return self._client.features(encode(image, "jpeg"))  # like the recorded training images

@@ -68,12 +68,11 @@ def load_engine(
     """Load the model in folder `run`, which `mtlnet.inference.model_card.resolve_run` finds by
     name.
 
-    `precision` None selects int8 if the model has an int8 graph that passed its accuracy gate and
-    is reliable on this processor (`uses_int8`), else bf16 if the processor supports it, else
-    float32. The torch engine supports only float32; with `gpu` it computes on a GPU if there is
-    one. `threads`: number of CPU threads for one image. `views`: number of views of each image
-    whose outputs are averaged, 1, 2 or 6; the time is proportional to this number. Raises
-    ModelError when the model is missing, unfinished or damaged.
+    `precision` None selects `default_precision` for OpenVINO. The torch engine supports only
+    float32; with `gpu` it computes on a GPU if there is one. `threads`: number of CPU threads for
+    one image. `views`: number of views of each image whose outputs are averaged, 1, 2 or 6; the
+    time is proportional to this number. Raises ModelError when the model is missing, unfinished or
+    damaged.
     """
     card = read_card(run)
     engine = _load_plain(run, card, kind, precision, threads, gpu=gpu)
@@ -141,7 +140,7 @@ class OpenVinoEngine:
 
         self.card = card
         best = best_precision()
-        self.precision: Precision = precision or ("int8" if uses_int8(run, card) else best)
+        self.precision: Precision = precision or default_precision(run, card)
         quantised = self.precision == "int8"
         options = {
             "INFERENCE_PRECISION_HINT": best if quantised else self.precision,
@@ -243,6 +242,13 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
         return False
     gate = about.get("gate") or {}
     return bool(gate.get("passed")) and (has_int8() or not gate.get("native_int8", False))
+
+
+def default_precision(run: Path, card: ModelCard) -> Precision:
+    """Return the precision in which OpenVINO computes the run's model by default on this processor:
+    int8 if the model has an int8 graph that passed its accuracy gate and is reliable here
+    (`uses_int8`), else bf16 if the processor supports it, else float32."""
+    return "int8" if uses_int8(run, card) else best_precision()
 
 
 def int8_graph(run: Path, card: ModelCard) -> Path:

@@ -6,8 +6,9 @@ counter-clockwise.
 """
 
 import hashlib
+import json
 import re
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Literal, Self
 
@@ -128,6 +129,13 @@ class Track:
     def driving_hash(self) -> str:
         """`content_hash` and the surface, which together determine how a car drives."""
         return f"{self.content_hash} {self.surface}"
+
+    @property
+    def picture_hash(self) -> str:
+        """SHA-256 (hex) of `driving_hash`, the scenery theme and the paint of the markings, which
+        together determine how a car drives and what its camera sees."""
+        seen = self.driving_hash, self.look, asdict(self.markings)
+        return hashlib.sha256(json.dumps(seen, sort_keys=True).encode()).hexdigest()
 
     @cached_property
     def _table(self) -> FloatArray:

@@ -14,13 +14,17 @@ import pytest
 from safetensors.numpy import save
 
 import controllers.compare.run as comparison
+from controllers import registry
+from controllers.compare import inputs
+from controllers.compare.cells import Cell, cells
 from controllers.compare.config import CompareConfig
-from controllers.compare.run import Cell, cells, compare, fingerprints
+from controllers.compare.inputs import fingerprints
+from controllers.compare.run import compare
 from controllers.laws.actor import SHIPPED, WEIGHTS, load_actor
 from runtime.files import locked_folder
 from simulator.track.catalogue import OWN_TRACKS, find_track
 from simulator.world.errors import ContactsUnavailable
-from tests.typed import typed
+from tests.typed import error_line, typed
 from trackfeatures import UserError
 
 SHORT = {"tracks": "oval,town", "controllers": "lqr,torcs", "steps": 60}
@@ -130,6 +134,26 @@ def test_a_users_controller_is_driven_again_when_its_file_has_changed(
     assert scores[0] == scores[1] != scores[2]
 
 
+@pytest.mark.parametrize("changed", ["_law", "_base"])
+def test_a_controller_that_a_package_imports_is_driven_again_when_its_file_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
+) -> None:
+    name = f"imported{changed}"  # a module of this process's own for each parameter
+    package = tmp_path / name
+    package.mkdir()
+    (package / "__init__.py").write_text(f"from {name}._law import Law\n")
+    (package / "_base.py").write_text(LAW.format(gain=0.2))
+    (package / "_law.py").write_text(
+        f"from {name}._base import Law as Base\nclass Law(Base):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    config = short(tmp_path, tracks="oval", controllers=f"{name}:Law")
+    before = fingerprints(config, cells(config))
+    with (package / f"{changed}.py").open("a") as file:
+        file.write("# changed\n")
+    assert fingerprints(config, cells(config)) != before
+
+
 def test_a_trained_actor_is_driven_again_when_it_was_trained_further(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -155,8 +179,8 @@ def test_a_drive_on_a_model_depends_on_its_weights(
     )
     codes = []
     for weights in ("one", "other"):
-        monkeypatch.setattr(comparison, "model_hash", lambda run, weights=weights: weights)
-        monkeypatch.setattr(comparison, "service_identity", lambda url, weights=weights: weights)
+        monkeypatch.setattr(inputs, "model_identity", lambda run, weights=weights: weights)
+        monkeypatch.setattr(inputs, "service_identity", lambda url, weights=weights: weights)
         codes.append(list(fingerprints(config, cells(config)).values()))
     assert codes[0][0] == codes[1][0]
     assert len({codes[0][0], codes[0][1], codes[1][1]}) == 3
@@ -169,7 +193,7 @@ def test_a_drive_of_a_shipped_actor_that_has_changed_is_driven_again(
     config = short(tmp_path, tracks="oval", controllers="rl,lqr")
     before = [*fingerprints(config, cells(config)).values()]
     shutil.copytree(SHIPPED / "rl-residual", tmp_path / "weights" / "rl")
-    monkeypatch.setattr(comparison, "SHIPPED", tmp_path / "weights")
+    monkeypatch.setattr(registry, "SHIPPED", tmp_path / "weights")
     after = [*fingerprints(config, cells(config)).values()]
     assert before[0] != after[0]
     assert before[1] == after[1]
@@ -197,15 +221,34 @@ def test_a_drive_on_another_surface_is_driven_again(tmp_path: Path) -> None:
     assert len(codes) == 2
 
 
+@pytest.mark.parametrize(
+    ("pattern", "text"), [("^look = .*$", 'look = "town"'), ("^kerbs = .*$", "kerbs = false")]
+)
+def test_a_drive_on_images_of_another_look_or_paint_is_driven_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pattern: str, text: str
+) -> None:
+    monkeypatch.setattr(inputs, "service_identity", lambda url: "same")
+    track = tmp_path / "mine.toml"
+    perceptions = "truth,model,http://service"
+    config = short(tmp_path, tracks=str(track), controllers="lqr", perceptions=perceptions)
+    before = (OWN_TRACKS / "circuit.toml").read_text()
+    codes = []
+    for content in (before, re.sub(pattern, text, before, flags=re.M)):
+        track.write_text(content)
+        codes.append([*fingerprints(config, cells(config)).values()])
+    pairs = zip(*codes, strict=True)
+    assert [one == other for one, other in pairs] == [True, False, False]
+
+
 def test_a_drive_of_changed_control_laws_is_driven_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = short(tmp_path, tracks="oval", controllers="mpc-kalman")
     before = fingerprints(config, cells(config))
-    shutil.copytree(comparison.LAWS, tmp_path / "laws")
+    shutil.copytree(registry.LAWS, tmp_path / "laws")
     with (tmp_path / "laws" / "delay.py").open("a") as file:
         file.write("# another delay\n")
-    monkeypatch.setattr(comparison, "LAWS", tmp_path / "laws")
+    monkeypatch.setattr(registry, "LAWS", tmp_path / "laws")
     assert fingerprints(config, cells(config)) != before
 
 
@@ -261,6 +304,51 @@ def test_other_settings_and_unknown_names_are_refused(
     with pytest.raises(UserError, match=message):
         compare(replace(config, **changes))
     assert (config.out / "results.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("null", "is no file of `controllers tune`"),
+        ("5", "is no file of `controllers tune`"),
+        ("[]", "is no file of `controllers tune`"),
+        ("{}", "has parameters of no controller, but not of lqr, torcs; name"),
+        ('{"mpc": {"parameters": {}}}', "has parameters of mpc, but not of lqr, torcs; name"),
+    ],
+)
+def test_a_file_without_parameters_of_the_controllers_is_refused(
+    tmp_path: Path, content: str, message: str
+) -> None:
+    tuned = tmp_path / "t.json"
+    tuned.write_text(f'{{"controllers": {content}}}')
+    words = ("--controllers", "lqr,torcs", "--parameters", tuned, "--out", tmp_path / "out")
+    refused = typed("controllers", "compare", "--tracks", "oval", "--steps", "40", *words)
+    assert error_line(refused).startswith(f"error: {tuned} {message}")
+    assert not (tmp_path / "out").exists()
+
+
+def test_parameters_of_one_of_the_controllers_are_enough(tmp_path: Path) -> None:
+    tuned = tmp_path / "t.json"
+    tuned.write_text('{"controllers": {"lqr": {"parameters": {"offset": 9.0}}}}')
+    config = short(tmp_path, tracks="oval", parameters=tuned)
+    assert [inputs.parameters_of(config, name) for name in ("lqr", "torcs")] == [{"offset": 9}, {}]
+    assert len(compare(config)["drives"]) == 2
+
+
+def test_all_drives_use_the_model_that_is_latest_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "runs" / "one").mkdir(parents=True)
+    (tmp_path / "runs" / "latest").symlink_to("one")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(comparison, "fingerprints", lambda config, todo: dict.fromkeys(todo, ""))
+    models: list[str] = []
+    monkeypatch.setattr(
+        comparison, "drive_cells", lambda config, *rest: models.append(config.model) or ()
+    )
+    with pytest.raises(KeyError):  # no drive is made
+        compare(short(tmp_path, tracks="oval", perceptions="model", model="latest"))
+    assert models == [str(tmp_path / "runs" / "one")]
 
 
 def test_results_from_before_the_option_views_are_continued(tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
 """Sources of perception: parsed and refused predictions, images of the model's camera."""
 
+import json
 from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,17 +15,25 @@ from controllers.perception.sources import (
     CameraPerception,
     LocalModel,
     ServiceModel,
+    model_identity,
     open_perception,
     parse_camera,
     parse_prediction,
 )
-from mtlnet.inference.engine import load_engine
+from mtlnet.inference.engine import INT8, load_engine
 from mtlnet.inference.golden_image import golden_image
-from mtlnet.inference.model_card import resolve_run
+from mtlnet.inference.model_card import (
+    GRAPH,
+    UNCERTAINTY_WEIGHTS,
+    WEIGHTS,
+    read_card,
+    resolve_run,
+)
 from mtlnet.inference.prediction import decode_outputs
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
+from tests.serve.conftest import CARD, constant_engine, serving
 from trackfeatures import VERSION, DefinitionsMismatch, RoadClass, UserError
 from trackfeatures.camera import CameraParameters
 
@@ -142,6 +153,42 @@ def test_the_identity_of_a_service_contains_its_views(
         monkeypatch.setattr(client, "card", {**client.card, "views": views})
         found.add(ServiceModel("http://127.0.0.1:8000").identity)
     assert len(found) == 2
+
+
+def test_the_identity_of_a_service_contains_the_hashes_of_the_models_files(
+    client: type[FakeClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = set()
+    for files in ({"a": "1"}, {"a": "2"}, {"a": "1", UNCERTAINTY_WEIGHTS: "3"}):
+        engine = constant_engine()
+        engine.card = replace(CARD, files={WEIGHTS: "ab" * 32, **files})
+        with serving(engine) as service:
+            monkeypatch.setattr(client, "card", service.ask("GET", "/model").content)
+        found.add(ServiceModel("http://127.0.0.1:8000").identity)
+    assert len(found) == 3
+    assert all(None not in json.loads(identity).values() for identity in found)
+
+
+def test_the_identity_of_a_model_contains_its_files_and_its_precision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mtlnet.inference.engine.best_precision", lambda: "f32")
+    monkeypatch.setattr("mtlnet.inference.engine.has_int8", lambda: True)
+    card = read_card(resolve_run("default"))
+    card.write(tmp_path)
+    found = [model_identity(str(tmp_path))]
+    (tmp_path / INT8).mkdir(parents=True)
+    for graph in ("one", "other"):
+        about = {"model_hash": card.model_hash, "files": {GRAPH: graph}, "gate": {"passed": True}}
+        (tmp_path / INT8 / "export.json").write_text(json.dumps(about))
+        found.append(model_identity(str(tmp_path)))
+    monkeypatch.setattr("mtlnet.inference.engine.has_int8", lambda: False)
+    about["gate"] = {"passed": True, "native_int8": True}
+    (tmp_path / INT8 / "export.json").write_text(json.dumps(about))
+    assert model_identity(str(tmp_path)) == found[0]
+    replace(card, files={**card.files, UNCERTAINTY_WEIGHTS: "3"}).write(tmp_path)
+    found.append(model_identity(str(tmp_path)))
+    assert len(set(found)) == 4
 
 
 def test_a_service_with_other_definitions_or_no_camera_is_refused(
