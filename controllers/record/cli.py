@@ -3,6 +3,8 @@
 controllers record --controller lqr --rounds 12 --out datasets/driven
 """
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -78,7 +80,10 @@ def record(config: RecordConfig, as_json: bool) -> None:
     command again.
     """
     from controllers.record.law import MakePerceivedLaw
+    from mtlnet.inference.model_card import resolve_run
 
+    # "latest" may become another run while the rounds are recorded.
+    config = replace(config, model=str(resolve_run(config.model)))
     plan, classes = _plan(config)
     make_law = MakePerceivedLaw(config.controller, config.model)
     result = record_plan(
@@ -89,18 +94,20 @@ def record(config: RecordConfig, as_json: bool) -> None:
 
 
 def _plan(config: RecordConfig) -> "tuple[Plan, ClassShares]":
-    """Return the plan of the rounds, with the names of the controller and the model, and the
-    expected shares of the road classes.
+    """Return the plan of the rounds, and the expected shares of the road classes. `config.model` is
+    a folder. The plan has the name of the controller, the hash of the model's weights, and a hash
+    of the files of both.
 
     Raises UserError for a controller that cannot be made, or a model for another camera.
     """
     from controllers.interface import LoopConfig
-    from controllers.registry import make_controller
+    from controllers.registry import controller_code, make_controller
     from datagen.planning.class_balance import TrackForecast
+    from datagen.planning.plan import DRIVER_FILES
     from datagen.planning.planner import make_plan
     from datagen.planning.summary import expected_classes
     from datagen.planning.tracks import choose_tracks
-    from mtlnet.inference.model_card import read_card, resolve_run
+    from mtlnet.inference.model_card import read_card
 
     collected = CollectConfig(
         rounds=config.rounds,
@@ -117,7 +124,7 @@ def _plan(config: RecordConfig) -> "tuple[Plan, ClassShares]":
         split=config.split,
     )
     make_controller(config.controller, LoopConfig(0.05, noisy=True))
-    card = read_card(resolve_run(config.model))
+    card = read_card(Path(config.model))
     if card.camera != collected.camera:
         raise UserError(
             f"model {card.name} was trained for {card.camera}, rounds are recorded with "
@@ -130,6 +137,8 @@ def _plan(config: RecordConfig) -> "tuple[Plan, ClassShares]":
         replace(entry, id=f"{DRIVEN}{config.seed}-{entry.id.removeprefix('round-')}")
         for entry in plan.rounds
     )
-    driver = {"controller": config.controller, "model": card.model_hash}
+    content = controller_code(config.controller) + json.dumps(card.files, sort_keys=True).encode()
+    files = hashlib.sha256(content).hexdigest()
+    driver = {"controller": config.controller, "model": card.model_hash, DRIVER_FILES: files}
     plan = replace(plan, rounds=rounds, driver=driver)
     return plan, expected_classes(plan, forecast)

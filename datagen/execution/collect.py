@@ -9,6 +9,7 @@ import json
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,7 +19,7 @@ from datagen.execution.process_pool import ProcessPool
 from datagen.execution.progress import CollectProgress, CollectResult, ProgressCallback
 from datagen.execution.retry import Failure, OnMessage
 from datagen.planning.config import LATER
-from datagen.planning.plan import Plan, RoundPlan, Shard, program
+from datagen.planning.plan import DRIVER_FILES, Plan, RoundPlan, Shard, program
 from datagen.recorder.job import Job
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
@@ -198,6 +199,8 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
             f"{folder} was made by {maker}, this is {program()}; finish it with that "
             "version, or choose another folder with --out"
         )
+    if driver and DRIVER_FILES not in driver:  # a plan of an earlier version
+        plan = replace(plan, driver={k: v for k, v in plan.driver.items() if k != DRIVER_FILES})
     if found_hash != plan.hash:
         raise DatasetError(
             f"{folder} was begun with another plan ({_differences(options, driver, plan)}); give "
@@ -234,7 +237,7 @@ def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -
 
 
 def _named(driver: Mapping[str, str]) -> str:
-    return ", ".join(driver.values()) or "the scripted one"
+    return ", ".join(f"{name} {value}" for name, value in driver.items()) or "the scripted one"
 
 
 def _short(value: Any) -> str:

@@ -21,6 +21,9 @@ from trackfeatures.names import require_name
 
 CONTROL_HZ = 20
 """Lowest rate of control steps, Hz; at a lower frame rate there are several steps per frame."""
+DRIVER_FILES = "files"
+"""Key of a plan's driver: a hash of the files of the controller and the model. Plans of earlier
+versions do not have this key."""
 
 
 def program() -> str:
@@ -100,8 +103,8 @@ class Plan:
     config: CollectConfig
     rounds: tuple[RoundPlan, ...]
     driver: Mapping[str, str] = field(default_factory=dict)
-    """Controller and hash of the model, if they drive instead of the scripted driver. They are part
-    of the plan's hash, because the rounds depend on them."""
+    """Controller, hash of the model's weights and hash of the files of both, if they drive instead
+    of the scripted driver. They are part of the plan's hash, because the rounds depend on them."""
 
     @property
     def hash(self) -> str:

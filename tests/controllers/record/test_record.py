@@ -2,33 +2,43 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from controllers.interface import LoopConfig
 from controllers.perception.perceived import Perceived
-from controllers.record.law import PerceivedLaw
+from controllers.record.cli import RecordConfig, _plan
+from controllers.record.law import MakePerceivedLaw, PerceivedLaw
+from datagen.execution.collect import initialise_folder, require_matching_folder
 from datagen.execution.merge import merge
+from datagen.execution.progress import CollectResult
 from datagen.recorder.replay import replay
 from datagen.recording import Dataset, Labels
 from datagen.recording.errors import DatasetError
 from datagen.recording.integrity.verify import verify
 from mtlnet.data.rounds import open_training_dataset
+from mtlnet.inference.model_card import resolve_run
 from mtlnet.training.sources import recorded_training_data
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
 from tests.typed import typed
-from trackfeatures import RoadClass
+from trackfeatures import RoadClass, UserError
 
 SHORT = ["--rounds", "2", "--frames", "60", "--tracks", "oval", "--lanes", "1", "--workers", "1"]
 COMMAND = [sys.executable, "-m", "controllers", "record", *SHORT, "--lights", "clear", "--json"]
+
+
+LAW = "class Law:\n    def update(self, observation):\n        return 0.0\n"
 
 
 def record(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
@@ -78,9 +88,47 @@ def test_the_plan_names_the_driver_and_another_one_is_refused(recorded: Path) ->
     assert len(driver["model"]) == 64
     refused = record(recorded, "--controller", "lqr-preview")
     assert refused.returncode != 0
-    assert "driver: lqr, " in refused.stderr.replace("\n", " ")
+    assert "driver: controller lqr, " in refused.stderr.replace("\n", " ")
     with pytest.raises(DatasetError, match="not by the scripted driver"):
         replay(recorded, 1)
+
+
+def test_another_law_in_the_file_of_a_controller_is_refused(tmp_path: Path) -> None:
+    law, out = tmp_path / "law.py", tmp_path / "out"
+    law.write_text(LAW)
+    options = RecordConfig(f"{law}:Law", str(resolve_run("default")), rounds=1, tracks="oval")
+    begun, _ = _plan(options)
+    out.mkdir()
+    initialise_folder(out, begun)
+    law.write_text(LAW.replace("0.0", "0.1"))
+    changed, _ = _plan(options)
+    with pytest.raises(DatasetError, match=r"driver: controller .*:Law, model .*, files .* in its"):
+        require_matching_folder(out, changed)
+    earlier = {name: value for name, value in begun.driver.items() if name != "files"}
+    initialise_folder(out, replace(begun, driver=earlier))
+    require_matching_folder(out, changed)  # a plan of an earlier version has no hash of the files
+    with pytest.raises(DatasetError, match="driver: controller"):
+        require_matching_folder(out, replace(changed, driver={**changed.driver, "model": "other"}))
+    with pytest.raises(DatasetError, match=r"driver: controller .* now the scripted one"):
+        require_matching_folder(out, replace(changed, driver={}))
+
+
+def test_the_workers_load_the_model_that_is_latest_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tmp_path / "runs" / "one"
+    shutil.copytree(resolve_run("default"), model)
+    (tmp_path / "runs" / "latest").symlink_to("one")
+    laws: list[MakePerceivedLaw] = []
+
+    def recorded_plan(*arguments: Any) -> CollectResult:
+        laws.append(arguments[-1])
+        raise UserError("nothing is recorded")
+
+    monkeypatch.setattr("controllers.record.cli.record_plan", recorded_plan)
+    options = ("--rounds", "1", "--tracks", "oval", "--model", "latest")
+    typed("controllers", "record", *options, folder=tmp_path)
+    assert laws == [MakePerceivedLaw("lqr", str(model))]
 
 
 @pytest.mark.extended
