@@ -19,7 +19,7 @@ from datagen.execution.process_pool import ProcessPool
 from datagen.execution.progress import CollectProgress, CollectResult, ProgressCallback
 from datagen.execution.retry import Failure, OnMessage
 from datagen.planning.config import LATER
-from datagen.planning.plan import DRIVER_FILES, Plan, RoundPlan, Shard, program
+from datagen.planning.plan import DRIVER_FILES, Plan, RoundPlan, Shard, changed_track, program
 from datagen.recorder.job import Job
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
@@ -189,6 +189,7 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         found = json.loads(path.read_text())
         found_hash, definitions, options = found["hash"], found["definitions"], found["wanted"]
         maker, driver = found["program"], found.get("driver", {})
+        changed = changed_track(found["rounds"], [entry.as_dict() for entry in plan.rounds])
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"{path} cannot be read ({error!r}); choose another folder with --out"
@@ -206,7 +207,11 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
             f"{folder} was begun with another plan ({_differences(options, driver, plan)}); give "
             "the same options to finish it, or choose another folder with --out"
         )
-
+    if changed is not None:
+        raise DatasetError(
+            f"{folder} was begun with another surface, scenery or paint of the track {changed}; "
+            "restore the track to finish it, or choose another folder with --out"
+        )
     if foreign := foreign_files(folder, plan):
         raise DatasetError(
             f"{foreign[0]} is no round of this plan; move it out of the dataset, or choose another "

@@ -8,13 +8,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import trackfeatures as tf
 from datagen.execution.collect import PLAN_FILE
 from datagen.execution.lock import folder_lock
-from datagen.planning.plan import check_entry
+from datagen.planning.plan import changed_track, check_entry
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
@@ -56,8 +57,10 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
     """
     plan = _merge_plans([_read_plan(folder) for folder in folders], folders)
     if (out / PLAN_FILE).is_file():
-        if _read_plan(out)["hash"] != plan["hash"]:
+        begun = _read_plan(out)
+        if begun["hash"] != plan["hash"]:
             raise DatasetError(f"{out} was begun with other folders; choose another --out")
+        _require_same_tracks([begun, plan], [out, folders[0]])
     elif out.exists() and not (out.is_dir() and is_unstarted(out, PLAN_FILE)):
         raise DatasetError(f"{out} exists and is not a dataset; choose another --out")
     out.mkdir(parents=True, exist_ok=True)
@@ -131,6 +134,7 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
     Raises DatasetError if different plans have different cameras or share a round id or a seed.
     With a shared seed, the same road in the same scenery could be in training and in test.
     """
+    _require_same_tracks(plans, folders)
     parts = {plan["hash"]: plan for plan in plans}
     if len(parts) == 1:
         return plans[0]
@@ -161,6 +165,19 @@ def _merge_plans(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> di
         **(joined if drivers else {}),
         "rounds": entries,
     }
+
+
+def _require_same_tracks(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> None:
+    """Raise DatasetError if two folders of one plan were recorded with another surface, scenery or
+    paint of a track."""
+    for (plan, folder), (other, another) in combinations(zip(plans, folders, strict=True), 2):
+        if plan["hash"] != other["hash"]:
+            continue
+        if track := changed_track(plan["rounds"], other["rounds"]):
+            raise DatasetError(
+                f"{folder} and {another} were recorded with another surface, scenery or paint of "
+                f"the track {track}; record one of them again with the track of the other"
+            )
 
 
 def _require_one_camera(plans: Sequence[dict[str, Any]], folders: Sequence[Path]) -> None:

@@ -45,6 +45,8 @@ class TrackChoice:
 
     name: str
     content_hash: str
+    picture_hash: str = ""
+    """Hash of geometry, surface, scenery and paint (`Track.picture_hash`); "" for unknown."""
 
 
 Rounds = Annotated[int, Option(help="Number of rounds (recorded drives).")]
@@ -139,6 +141,8 @@ class CollectConfig:
         """Return the options by name. An option that did not exist in earlier versions (key of
         `LATER`) is left out if it has its default."""
         options = asdict(self, dict_factory=stored)
+        for track in options["tracks"]:  # the entries of the rounds have it
+            del track["picture_hash"]
         return {k: v for k, v in options.items() if k not in LATER or v != LATER[k]}
 
     def round_id(self, number: int) -> str:

@@ -6,8 +6,8 @@ An entry determines its round completely. `datagen.planning.planner` makes the e
 import hashlib
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -30,6 +30,20 @@ def program() -> str:
     """Return name and version of this program. A plan's hash contains them, because another version
     can record the same round differently."""
     return f"driverview {version('driverview')}"
+
+
+def changed_track(
+    entries: Iterable[dict[str, Any]], others: Iterable[dict[str, Any]]
+) -> str | None:
+    """Return the name of a track whose surface, scenery or paint differs between two lists of
+    rounds' entries in plans of equal hash; None if there is none. An entry of an earlier version
+    has no hash of them, and counts as equal."""
+    known = {entry["id"]: entry.get("picture_hash") for entry in entries}
+    for entry in others:
+        pair = known.get(entry["id"]), entry.get("picture_hash")
+        if all(pair) and pair[0] != pair[1]:
+            return str(entry["track"])
+    return None
 
 
 def check_entry(entry: dict[str, Any]) -> str:
@@ -67,13 +81,18 @@ class RoundPlan:
     lane_width_m: float = tf.LANE_WIDTH_M
     varied: VariedRound | None = None
     """The random values of a varied road; None on the paper's roads."""
+    picture_hash: str = ""
+    """Hash of the track's geometry, surface, scenery and paint; "" in a plan of an earlier version,
+    which has only `track_hash`."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the entry as it is written to `plan.json`. The key `varied`, which earlier
-        versions did not have, is left out on the paper's roads."""
+        """Return the entry as it is written to `plan.json`. Two keys, which earlier versions did
+        not have, can be missing: `varied` on the paper's roads, and an unknown `picture_hash`."""
         entry = asdict(self, dict_factory=stored)
         if self.varied is None:
             del entry["varied"]
+        if not self.picture_hash:
+            del entry["picture_hash"]
         return entry
 
     @property
@@ -108,8 +127,10 @@ class Plan:
 
     @property
     def hash(self) -> str:
-        """SHA-256 (hex) of all entries, the driver, the program and the definitions' version."""
-        content: list[Any] = [tf.VERSION, program(), [entry.as_dict() for entry in self.rounds]]
+        """SHA-256 (hex) of all entries, the driver, the program and the definitions' version. The
+        hashes of pictures are left out, so that a plan keeps the hash of earlier versions."""
+        entries = [replace(entry, picture_hash="").as_dict() for entry in self.rounds]
+        content: list[Any] = [tf.VERSION, program(), entries]
         if self.driver:
             content.append(dict(self.driver))
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -71,6 +71,7 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
             nominal_camera=config.camera,
             lane_width_m=_lane_width(roads[number]),
             varied=roads[number],
+            picture_hash=tracks[number].picture_hash,
         )
         for number in range(count)
     )
@@ -167,7 +168,7 @@ def _track(choice: TrackChoice, round_seed: int) -> TrackChoice:
     if choice.name != RANDOM:
         return choice
     track = random_track(random_name(round_seed))
-    return TrackChoice(track.name, track.content_hash)
+    return TrackChoice(track.name, track.content_hash, track.picture_hash)
 
 
 def _lights(config: CollectConfig, rng: np.random.Generator) -> list[tuple[str, ...]]:

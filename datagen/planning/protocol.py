@@ -69,6 +69,7 @@ def _drive(like: RoundPlan, track: Track, light: str, seed: int, frames: int) ->
         split=UNSEEN if track.name in HELD_OUT else "test",
         track=track.name,
         track_hash=track.content_hash,
+        picture_hash=track.picture_hash,
         lanes=1,
         traffic=0,
         trajectory=MIDDLE,

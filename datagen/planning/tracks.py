@@ -16,7 +16,7 @@ them. A plan with `--split unseen` uses only them by default."""
 def choose_tracks(
     names: tuple[str, ...], tracks_dir: Path | None, unseen: bool = False
 ) -> tuple[TrackChoice, ...]:
-    """Return the named tracks with the hashes of their geometry.
+    """Return the named tracks with their hashes.
 
     Without names: all tracks of the project and of TORCS that are found, except `HELD_OUT`; with
     `unseen`, the tracks of `HELD_OUT` that are found. The name `random` is kept: the plan later
@@ -35,7 +35,8 @@ def choose_tracks(
 def _choice(name: str, tracks_dir: Path | None) -> TrackChoice:
     if name == RANDOM:
         return TrackChoice(name, content_hash="")
-    return TrackChoice(name, find_track(name, tracks_dir).content_hash)
+    track = find_track(name, tracks_dir)
+    return TrackChoice(name, track.content_hash, track.picture_hash)
 
 
 def _trained_on(file: Path) -> bool:

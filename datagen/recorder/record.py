@@ -200,10 +200,10 @@ def open_simulation(
     track is missing or changed, or if the machine cannot render.
     """
     track = _track(plan.track, tracks_dir)
-    if track.content_hash != plan.track_hash:
+    if track.content_hash != plan.track_hash or plan.picture_hash not in ("", track.picture_hash):
         raise tf.UserError(
-            f"track {plan.track} is not the one this dataset was planned with (its geometry has "
-            "changed); collect into another folder"
+            f"track {plan.track} is not the one this dataset was planned with (its geometry, "
+            "surface, scenery or paint has changed); collect into another folder"
         )
     carriageway = plan.varied.carriageway if plan.varied else None
     road = Road(track, plan.lanes, plan.lane_width_m, carriageway)

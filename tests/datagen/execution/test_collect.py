@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,14 +14,19 @@ import pytest
 
 import trackfeatures as tf
 from datagen.cli.collect import Lights
-from datagen.execution.collect import collect, require_matching_folder
-from datagen.planning.config import all_lights
-from datagen.planning.plan import RoundPlan
+from datagen.execution.collect import collect, initialise_folder, require_matching_folder
+from datagen.execution.merge import merge
+from datagen.planning.config import CollectConfig, all_lights
+from datagen.planning.plan import Plan, RoundPlan
+from datagen.planning.planner import make_plan
+from datagen.planning.tracks import choose_tracks
 from datagen.recorder.job import RoundDone
+from datagen.recorder.record import open_simulation
 from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import read_states
 from datagen.recording.integrity.verify import verify
+from simulator.track.catalogue import OWN_TRACKS
 from tests.datagen.commands import (
     SHORT,
     attempted,
@@ -30,6 +36,7 @@ from tests.datagen.commands import (
     make_small_plan,
 )
 from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
 
 
 def test_a_collected_dataset_passes_verify_and_can_be_read(collected: Path) -> None:
@@ -162,6 +169,46 @@ def test_a_dataset_of_another_program_version_is_not_continued(tmp_path: Path) -
     (tmp_path / "plan.json").write_text(json.dumps(content))
     with pytest.raises(DatasetError, match=r"made by driverview 0\.0\.1, this is driverview "):
         collect(plan, tmp_path, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "text"),
+    [
+        ("^look = .*$", 'look = "town"'),
+        ("^kerbs = .*$", "kerbs = false"),
+        ("^surface = .*$", 'surface = "gravel"'),
+    ],
+)
+def test_a_dataset_is_not_continued_on_a_track_of_another_look_paint_or_surface(
+    tmp_path: Path, pattern: str, text: str
+) -> None:
+    track, plans = tmp_path / "mine.toml", list[Plan]()
+    before = (OWN_TRACKS / "circuit.toml").read_text()
+    for content in (before, re.sub(pattern, text, before, flags=re.M)):
+        assert content != before or not plans
+        track.write_text(content)
+        tracks = choose_tracks((str(track),), None)
+        plans.append(make_plan(CollectConfig(2, 10, tracks=tracks)))
+    begun, changed = plans
+    assert begun.hash == changed.hash  # as in earlier versions
+    with (
+        pytest.raises(UserError, match="is not the one this dataset was planned with"),
+        open_simulation(begun.rounds[0], None),
+    ):
+        pass
+    folders = tmp_path / "begun", tmp_path / "changed"
+    for folder, plan in zip(folders, plans, strict=True):
+        folder.mkdir()
+        initialise_folder(folder, plan)
+        require_matching_folder(folder, plan)
+    with pytest.raises(DatasetError, match="begun with another surface, scenery or paint of the"):
+        require_matching_folder(folders[0], changed)
+    with pytest.raises(DatasetError, match="were recorded with another surface, scenery or paint"):
+        merge(folders, tmp_path / "both")
+    for entry in (content := begun.as_json())["rounds"]:
+        del entry["picture_hash"]
+    (folders[0] / "plan.json").write_text(json.dumps(content))  # as earlier versions wrote it
+    require_matching_folder(folders[0], changed)
 
 
 def test_without_a_renderer_the_error_says_what_to_install(tmp_path: Path) -> None:

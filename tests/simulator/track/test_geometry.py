@@ -1,6 +1,7 @@
 """Track geometry in closed form, and projection against a brute-force search."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,6 +153,19 @@ def test_equal_geometry_has_an_equal_content_hash() -> None:
     assert stadium().content_hash == STADIUM.content_hash
     assert len(STADIUM.content_hash) == 64
     assert EIGHT.content_hash != STADIUM.content_hash
+
+
+def test_surface_scenery_and_paint_change_the_hash_of_pictures() -> None:
+    painted = replace(STADIUM.markings, kerbs=not STADIUM.markings.kerbs)
+    tracks = [
+        STADIUM,
+        EIGHT,
+        replace(STADIUM, surface="gravel"),
+        replace(STADIUM, look="coast"),
+        replace(STADIUM, markings=painted),
+    ]
+    assert len({track.picture_hash for track in tracks}) == 5
+    assert replace(STADIUM, name="other").picture_hash == STADIUM.picture_hash
 
 
 def test_road_widths_and_marking_offsets() -> None:
