@@ -343,10 +343,13 @@ def test_all_drives_use_the_model_that_is_latest_at_the_start(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(comparison, "fingerprints", lambda config, todo: dict.fromkeys(todo, ""))
     models: list[str] = []
-    monkeypatch.setattr(
-        comparison, "drive_cells", lambda config, *rest: models.append(config.model) or ()
-    )
-    with pytest.raises(KeyError):  # no drive is made
+
+    def no_drives(config: CompareConfig, *rest: Any) -> list[Any]:
+        models.append(config.model)
+        return []
+
+    monkeypatch.setattr(comparison, "drive_cells", no_drives)
+    with pytest.raises(KeyError):
         compare(short(tmp_path, tracks="oval", perceptions="model", model="latest"))
     assert models == [str(tmp_path / "runs" / "one")]
 

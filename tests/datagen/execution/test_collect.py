@@ -205,9 +205,9 @@ def test_a_dataset_is_not_continued_on_a_track_of_another_look_paint_or_surface(
         require_matching_folder(folders[0], changed)
     with pytest.raises(DatasetError, match="were recorded with another surface, scenery or paint"):
         merge(folders, tmp_path / "both")
-    for entry in (content := begun.as_json())["rounds"]:
+    for entry in (earlier := begun.as_json())["rounds"]:
         del entry["picture_hash"]
-    (folders[0] / "plan.json").write_text(json.dumps(content))  # as earlier versions wrote it
+    (folders[0] / "plan.json").write_text(json.dumps(earlier))  # as earlier versions wrote it
     require_matching_folder(folders[0], changed)
 
 
