@@ -215,7 +215,8 @@ def merge(
     """Copy the rounds of several datasets into one dataset.
 
     The datasets are parts of one plan (`datagen collect --shard`), or datasets in which no two
-    rounds have the same name or seed.
+    rounds have the same name or seed. If several datasets have the same round, an undamaged one is
+    copied; if all are recovered, the one with the most frames.
     """
     from datagen.execution.merge import merge as run
 

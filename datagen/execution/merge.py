@@ -32,6 +32,7 @@ from datagen.recording.folder import (
     write_if_changed,
 )
 from datagen.recording.manifest import planned_split, rebuild
+from datagen.recording.mcap.index import open_round
 from runtime.files import file_hash
 from trackfeatures.camera import CameraParameters
 
@@ -50,7 +51,10 @@ class MergeResult:
 
 
 def merge(folders: Sequence[Path], out: Path) -> MergeResult:
-    """Copy the finished rounds of `folders` into `out`; rounds already in `out` stay.
+    """Copy the finished rounds of `folders` into `out`.
+
+    Of several files of a round, an undamaged one is used, otherwise the recovered one with the most
+    frames. A round in `out` is only replaced by a better file of the same round.
 
     Raises DatasetError for a folder without a plan, for plans that share rounds, and for a damaged
     round.
@@ -67,11 +71,11 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
     with folder_lock(out, None):
         write_if_changed(out / PLAN_FILE, json.dumps(plan, indent=1) + "\n")
         prepare(out)
-        present = read_states(out).keys()
-        found = {s.id: (folder, s) for folder in folders for s in read_states(folder).values()}
         planned = {entry["id"]: entry["split"] for entry in plan["rounds"]}
+        best = _best_rounds([out, *folders])
+        added = sorted(i for i, (folder, _) in best.items() if folder != out and i in planned)
         try:
-            _copy_rounds(found, sorted(found.keys() & planned.keys() - present), out)
+            _copy_rounds(best, added, out)
         except BaseException:
             with suppress(OSError, tf.UserError):  # the first error is reported, not a later one
                 discard_partials(out, planned)
@@ -82,11 +86,30 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
     return MergeResult(
         rounds=len(states),
         planned=len(planned),
-        added=len(states) - len(present & planned.keys()),
+        added=len(added),
         frames=sum(state.frames for state in states.values()),
         content_hash=str(statistics["content_hash"]),
         out=str(out),
     )
+
+
+def _best_rounds(folders: Sequence[Path]) -> dict[str, tuple[Path, RoundState]]:
+    """Return the folder and the state of the best file of each finished round, by id. A round that
+    was not recovered comes first, then the round with the most frames, then the first folder."""
+    found: dict[str, list[tuple[Path, RoundState]]] = {}
+    for folder in folders:
+        for state in read_states(folder).values():
+            found.setdefault(state.id, []).append((folder, state))
+    return {
+        round_id: files[0]
+        if len({state.sha256 for _, state in files}) == 1
+        else max(files, key=lambda file: (_is_undamaged(*file), file[1].frames))
+        for round_id, files in found.items()
+    }
+
+
+def _is_undamaged(folder: Path, state: RoundState) -> bool:
+    return open_round(folder / state.file, ()).recovery is None
 
 
 def _copy_rounds(

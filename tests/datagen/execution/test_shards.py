@@ -223,12 +223,13 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
         assert time.monotonic() < deadline
 
 
-def _with_recovered(whole: Path, folder: Path) -> tuple[Path, int]:
-    """A copy of the dataset in which round-001 was cut and recovered; and its number of frames."""
+def _with_recovered(whole: Path, folder: Path, kept: float = 0.75) -> tuple[Path, int]:
+    """A copy of the dataset in which round-001 was cut to the share `kept` of its bytes and
+    recovered; and its number of frames."""
     shutil.copytree(whole, folder)
     file = folder / "rounds" / "round-001.mcap"
     damaged = folder.parent / "cut.mcap"
-    damaged.write_bytes(file.read_bytes()[: file.stat().st_size * 3 // 4])
+    damaged.write_bytes(file.read_bytes()[: int(file.stat().st_size * kept)])
     file.unlink()
     saved = recover(damaged, file).saved
     assert 0 < saved < 20
@@ -279,3 +280,27 @@ def test_a_recovered_round_is_merged(whole: Path, tmp_path: Path) -> None:
     assert (merged.rounds, merged.frames) == (3, 40 + saved)
     assert read_split(split_path(tmp_path / "out")).recovered == ("round-001",)
     assert verify(tmp_path / "out", "full").ok
+
+
+@pytest.mark.parametrize("steps", [[[0, 1]], [[1, 0]], [[1], [0, 1]]])
+def test_merge_prefers_an_undamaged_round_to_a_recovered_one(
+    whole: Path, tmp_path: Path, steps: list[list[int]]
+) -> None:
+    recovered, saved = _with_recovered(whole, tmp_path / "data")
+    folders, out = (whole, recovered), tmp_path / "out"
+    for number, step in enumerate(steps):
+        # The last step replaces the recovered round if an earlier step has copied it.
+        merged = merge([folders[i] for i in step], out)
+        assert (merged.rounds, merged.added) == (3, 3 if number == 0 else 1)
+    assert (merged.frames, saved < 20) == (60, True)
+    assert files(out) == files(whole)
+    assert read_split(split_path(out)).recovered == ()
+    assert verify(out, "full").ok
+
+
+def test_merge_takes_the_recovered_round_with_the_most_frames(whole: Path, tmp_path: Path) -> None:
+    one, saved = _with_recovered(whole, tmp_path / "one")
+    other, fewer = _with_recovered(whole, tmp_path / "other", kept=0.5)
+    assert fewer < saved
+    for number, folders in enumerate(([one, other], [other, one])):
+        assert merge(folders, tmp_path / f"out{number}").frames == 40 + saved
