@@ -72,7 +72,8 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
     If `out` is in `rounds/` of a dataset, it becomes a round of the dataset, marked as recovered.
     Raises DatasetError if nothing can be saved or `out` cannot be used, and OSError.
     """
-    target = default_out(file) if out is None else out
+    file = file.absolute()  # the names of its folders decide whether it is in a dataset
+    target = default_out(file) if out is None else out.absolute()
     data = file.read_bytes()
     header = _header(file, data)
     in_dataset = target.parent.name == ROUNDS and (target.parent.parent / "state").is_dir()
@@ -102,7 +103,7 @@ def recover(file: Path, out: Path | None = None) -> Recovered:
 
 def default_out(file: Path) -> Path:
     """Return the default path of the recovered round: beside `file`, or in `recovered/` of the
-    dataset if `file` is one of its rounds."""
+    dataset if `file`, an absolute path, is one of its rounds."""
     if file.parent.name == ROUNDS:
         return file.parent.parent / "recovered" / file.name
     return file.with_name(f"{file.stem}.recovered.mcap")

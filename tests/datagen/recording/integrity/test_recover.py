@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 from datagen.recording import Dataset, DatasetError
-from datagen.recording.folder import round_path, state_path
+from datagen.recording.folder import read_states, round_path, state_path
 from datagen.recording.frame import Frame
 from datagen.recording.integrity.recover import recover
 from datagen.recording.integrity.verify import verify
@@ -179,6 +179,20 @@ def test_the_command_writes_to_the_folder_recovered(dataset: Path) -> None:
     aside = dataset.parent / "mine.mcap"
     done = datagen_here("recover", str(path), "--out", str(aside))
     assert done.stdout == f"{aside}: {result['saved']} frames saved, {result['lost']} lost\n"
+
+
+def test_a_round_named_from_within_its_folder_is_recovered_as_a_round_of_the_dataset(
+    samples: Samples, dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = round_path(dataset, "r001")
+    path.write_bytes(path.read_bytes()[:-30_000])
+    monkeypatch.chdir(path.parent)
+    done = recover(Path("r001.mcap"))
+    assert done.out == str(dataset / "recovered" / "r001.mcap")
+    assert (done.saved + done.lost, done.at_least) == (samples.frames_a_round, False)
+    path.unlink()
+    recover(Path(done.out), Path("r001.mcap"))
+    assert read_states(dataset)["r001"].frames == done.saved
 
 
 @pytest.mark.parametrize(
