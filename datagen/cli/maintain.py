@@ -119,7 +119,11 @@ def recover(
 def split(
     folder: DatasetFolder,
     name: Annotated[
-        str, typer.Option(help="Name of the split, which is the file DIR/splits/NAME.json.")
+        str,
+        typer.Option(
+            help="Name of the split, which is the file DIR/splits/NAME.json: letters, digits, '.', "
+            "'_' and '-'."
+        ),
     ] = "default",
     by: Annotated[
         str,

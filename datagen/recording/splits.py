@@ -50,7 +50,8 @@ class Split:
 
 
 def split_path(folder: Path, name: str = DEFAULT_SPLIT) -> Path:
-    return folder / "splits" / f"{name}.json"
+    """Return the path of the split file. Raises BadName if the name cannot be a file name."""
+    return folder / "splits" / f"{require_name(name, 'split name')}.json"
 
 
 def read_split(path: Path) -> Split:

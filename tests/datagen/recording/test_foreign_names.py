@@ -9,6 +9,7 @@ import pytest
 
 from datagen.execution.merge import merge
 from datagen.planning.plan import RoundPlan
+from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     RoundState,
@@ -20,6 +21,7 @@ from datagen.recording.folder import (
     state_path,
 )
 from datagen.recording.round_metadata import RoundHeader
+from datagen.recording.split_report import SplitConfig, make_split
 from datagen.recording.splits import read_split, split_path
 from tests.datagen.commands import make_small_plan
 from trackfeatures.names import BadName
@@ -34,6 +36,16 @@ def precious(tmp_path: Path) -> Path:
     kept.parent.mkdir()
     kept.write_text("mine")
     return kept
+
+
+@pytest.mark.parametrize("name", WAYS_OUT)
+def test_no_split_leaves_its_folder(dataset: Path, name: str) -> None:
+    before = sorted(dataset.parent.rglob("*"))
+    with pytest.raises(BadName, match="the split name is"):
+        make_split(dataset, name, SplitConfig("round", 0.5, 0, with_recovered=False))
+    with pytest.raises(BadName, match="the split name is"):
+        Dataset.open(dataset, name)
+    assert sorted(dataset.parent.rglob("*")) == before
 
 
 @pytest.mark.parametrize("name", ["../../precious", "PATH"])
