@@ -93,7 +93,8 @@ def evaluate_protocol(
 def drive_rows(frames: Frames, data: Path) -> dict[str, Rows]:
     """Return, by the names of `DRIVES`, the indices of the frames of each drive, in order.
 
-    Raises UserError if a drive is missing, or if all rounds are drives.
+    Raises UserError if a drive is missing, if all rounds are drives, or if `frames` lacks all
+    frames of a drive or of all other rounds.
     """
     labels = frames.labels
     found: dict[str, Rows] = {}
@@ -109,11 +110,16 @@ def drive_rows(frames: Frames, data: Path) -> dict[str, Rows]:
                 "record it with `datagen protocol --out DIR`"
             )
         found[name] = np.flatnonzero(labels.round == rounds[0])
-    if len(frames) == sum(map(len, found.values())):
+    if len(frames.rounds) == len(DRIVES):
         raise UserError(
             f"{data} holds drives but no rounds of the nine tracks; record it with "
             "`datagen protocol --out DIR`"
         )
+    counts = {name: len(rows) for name, rows in found.items()}
+    counts["the nine tracks"] = len(frames) - sum(counts.values())
+    for name, count in counts.items():
+        if not count:
+            raise UserError(f"--every leaves no frame of {name}; give a smaller number")
     return found
 
 

@@ -174,6 +174,18 @@ def test_every_nth_frame_is_evaluated(rounds: Path) -> None:
     assert table[FOUR]["distance_m"] == pytest.approx(0.070, abs=2e-6)
 
 
+@pytest.mark.parametrize(
+    ("every", "name"),
+    [(1000, "g-track-3, heavy shadow"), (27, "the nine tracks")],
+)
+def test_frames_that_lack_a_drive_are_refused_before_the_first_prediction(
+    rounds: Path, monkeypatch: pytest.MonkeyPatch, every: int, name: str
+) -> None:
+    monkeypatch.setattr("mtlnet.evaluation.protocol.predict_rounds", None)
+    with pytest.raises(UserError, match=f"--every leaves no frame of {name}; give a smaller"):
+        evaluated(rounds, every=every)
+
+
 def test_the_darkest_intervals_are_in_order_and_apart() -> None:
     shadow = np.full(100, 0.3, np.float32)
     shadow[[*range(10, 20), *range(40, 50), *range(55, 65), *range(80, 90)]] = 0.7
