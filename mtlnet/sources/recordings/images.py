@@ -4,7 +4,6 @@ A picture in a file format (JPEG, PNG, ...) gives the same pixels as a file with
 """
 
 import base64
-import binascii
 import json
 import struct
 from collections.abc import Callable
@@ -31,6 +30,8 @@ ROS_COMPRESSED, ROS_IMAGE, ROS_CALIBRATION = (
 FOXGLOVE = (COMPRESSED, RAW, VIDEO, CALIBRATION)
 ROS = (ROS_COMPRESSED, ROS_IMAGE, ROS_CALIBRATION)
 ENCODINGS = {**dict.fromkeys(FOXGLOVE, ("protobuf", "json")), **dict.fromkeys(ROS, ("cdr",))}
+NO_MESSAGE = (ValueError, TypeError, AttributeError, OverflowError, RecursionError)
+"""Exceptions for JSON that is no message, such as an infinite time or 100,000 nested lists."""
 IMAGES = (ROS_COMPRESSED, ROS_IMAGE, COMPRESSED, RAW, VIDEO)
 
 
@@ -106,7 +107,7 @@ def _from_json(data: bytes, schema: str) -> Any:
                 is_bytes = isinstance(getattr(message, name), bytes)
                 setattr(message, name, base64.b64decode(value) if is_bytes else value)
         return message
-    except (ValueError, TypeError, AttributeError, binascii.Error) as error:
+    except NO_MESSAGE as error:
         raise _damaged(schema, error) from error
 
 

@@ -112,7 +112,8 @@ def write_foxglove(
     finish: bool = True,
     chunk_bytes: int = 1 << 20,
 ) -> Path:
-    """A Foxglove file; fields of `foxglove.KIND` without the time, one time step per message."""
+    """A Foxglove file; fields of `foxglove.KIND` without the time, one time step per message. With
+    `as_json` the bytes of a whole message can replace its fields."""
     counts: dict[str, int] = {}
     channels: dict[str, int] = {}
     with path.open("wb") as file:
@@ -133,7 +134,9 @@ def write_foxglove(
     return path
 
 
-def _json(number: int, fields: dict[str, Any]) -> bytes:
+def _json(number: int, fields: dict[str, Any] | bytes) -> bytes:
+    if isinstance(fields, bytes):  # the whole message
+        return fields
     sec, nsec = stamp(number)
     plain = {
         name: base64.b64encode(value).decode() if isinstance(value, bytes) else value

@@ -183,6 +183,35 @@ def test_one_bad_message_costs_no_other(engine: BrightnessEngine, tmp_path: Path
     assert [row["image"][-1] for row in raised.value.results] == list("0234")
 
 
+DEEP = b"[" * 100_000
+BAD_JSON = [
+    b'{"timestamp": {"sec": 1e400}}',
+    b'{"timestamp": {"sec": 99999999999999999999}}',
+    b'{"timestamp": {"nsec": 1e10}}',
+    DEEP,
+    b'{"timestamp": ' + DEEP,
+    b'{"data": "\xff"}',
+    b'{"data": "\\ud800", "format": "jpeg"}',
+    b'{"data": "AAAA", "format": "\\ud800"}',
+    b"[1]",
+]
+
+
+@pytest.mark.parametrize("bad", BAD_JSON)
+def test_one_bad_json_message_costs_no_other(
+    engine: BrightnessEngine, tmp_path: Path, bad: bytes
+) -> None:
+    good = {"data": jpegs()[0], "format": "jpeg"}
+    calibration = ("/front/calibration", "CameraCalibration", bad)
+    messages: list[Message] = [("/front/image", "CompressedImage", c) for c in (good, bad, good)]
+    file = write_foxglove(tmp_path / "a.mcap", [calibration, *messages], as_json=True)
+    notes: list[str] = []
+    with pytest.raises(InputsLeftOut, match=r"a\.mcap#1 \(/front/image\): the message") as raised:
+        predict_files(engine, [str(file)], note=notes.append)
+    assert [row["image"][-1] for row in raised.value.results] == list("02")
+    assert "/front/calibration is not used" in "".join(notes)
+
+
 def test_pictures_that_change_their_size_end_the_recording(
     engine: BrightnessEngine, tmp_path: Path
 ) -> None:
