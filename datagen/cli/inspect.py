@@ -16,7 +16,10 @@ import trackfeatures as tf
 from datagen.planning.config import DATASET_FOLDER
 from datagen.recording.names import SIDES, UNSEEN
 from runtime.cli import AsJson, counted, print_result
+from trackfeatures.errors import UserError
 
+SHARD_SIZE = 1000  # frames of a tar file of WebDataset
+PORT = 9090  # default port of Rerun's viewer
 DatasetFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the dataset.")]
 
 
@@ -83,8 +86,12 @@ def export(
         ),
     ] = "all",
     shard_size: Annotated[
-        int, typer.Option(help="With --format webdataset: number of frames in each tar file.")
-    ] = 1000,
+        int | None,
+        typer.Option(
+            help="With --format webdataset: number of frames in each tar file.",
+            show_default=str(SHARD_SIZE),
+        ),
+    ] = None,
     shuffle: Annotated[
         bool,
         typer.Option(
@@ -103,7 +110,9 @@ def export(
     from datagen.export.run import export as run
 
     target = out or folder.resolve().with_name(f"{folder.resolve().name}-{kind}")
-    config = ExportConfig(kind, split, shard_size, shuffle)
+    if kind == "lerobot" and shard_size is not None:
+        raise UserError("LeRobot's files have no fixed number of frames; leave out --shard-size")
+    config = ExportConfig(kind, split, SHARD_SIZE if shard_size is None else shard_size, shuffle)
     with Console(stderr=True).status(f"reading {escape(str(folder))}") as status:
         done = run(folder, target, config, lambda n: status.update(f"{n:,} frames written"))
     megabytes = f"{done.bytes / 1e6:.1f} MB in {counted(done.files, 'file')}"
@@ -136,12 +145,13 @@ def view(
         ),
     ] = False,
     port: Annotated[
-        int,
+        int | None,
         typer.Option(
             help="With --web: port of the viewer. The data are served on the port with the next "
-            "number."
+            "number.",
+            show_default=str(PORT),
         ),
-    ] = 9090,
+    ] = None,
     as_json: Annotated[
         bool,
         typer.Option(
@@ -164,7 +174,9 @@ def view(
         print_result(result, as_json, f"{contents.about}\n{place}")
         sys.stdout.flush()  # with --web this process continues to run
 
-    config = ShowConfig(html, save, web, port)
+    if port is not None and not web:
+        raise UserError("--port is the port of --web; give both, or none")
+    config = ShowConfig(html, save, web, PORT if port is None else port)
     config.validate(recorded)
     contents = Contents.open(recorded)
     show(contents, config, on_shown)

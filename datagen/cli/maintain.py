@@ -68,6 +68,8 @@ def verify(
         raise UserError(f"there is no level {level!r}; choose {', '.join(LEVELS)}")
     if pixels and not replay:
         raise UserError("--pixels compares images that are rendered again; give --replay N, too")
+    if tracks_dir is not None and not replay:
+        raise UserError("--tracks-dir has the tracks of --replay; give --replay N, too")
     with Console(stderr=True).status(f"checking {escape(str(folder))}") as status:
         report = run(folder, level, lambda name: status.update(f"checked {name}"))
         replayed: list[str] = []
@@ -134,12 +136,16 @@ def split(
         ),
     ] = "",
     test_share: Annotated[
-        float,
-        typer.Option(help="With --by: share of the rounds that are kept for testing, 0 to 1."),
-    ] = CollectConfig.test_share,
+        float | None,
+        typer.Option(
+            help="With --by: share of the rounds that are kept for testing, 0 to 1.",
+            show_default=str(CollectConfig.test_share),
+        ),
+    ] = None,
     seed: Annotated[
-        int, typer.Option(help="With --by: seed of the random assignment, 0 or more.")
-    ] = 0,
+        int | None,
+        typer.Option(help="With --by: seed of the random assignment, 0 or more.", show_default="0"),
+    ] = None,
     with_recovered: Annotated[
         bool,
         typer.Option(
@@ -168,7 +174,12 @@ def split(
 
     tolerances = _tolerances(near)
     if by:
-        make_split(folder, name, SplitConfig(by, test_share, seed, with_recovered))
+        share = CollectConfig.test_share if test_share is None else test_share
+        make_split(folder, name, SplitConfig(by, share, seed or 0, with_recovered))
+    elif test_share is not None or seed is not None or with_recovered:
+        raise UserError(
+            "--test-share, --seed and --with-recovered belong to --by, which creates a split"
+        )
     report = check_split(folder, name, tolerances, made=bool(by))
     print_result(report.as_json(), as_json, format_report(report))
 

@@ -257,6 +257,9 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
     assert "--shuffle" in refused(
         "export", dataset, "--format", "lerobot", "--shuffle", "--out", out
     )
+    assert "leave out --shard-size" in refused(
+        "export", dataset, "--format", "lerobot", "--shard-size", "1000", "--out", out
+    )
     assert "no side 'dev'" in refused("export", dataset, "--split", "dev", "--out", out)
     assert "holds no recorded rounds" in refused("export", tmp_path / "no", "--out", out)
     samples.add_round(dataset, samples.header("r003", frequency_hz=10))

@@ -217,6 +217,9 @@ def test_the_command_refuses_a_leak_with_a_one_line_error(dataset: Path) -> None
         ({"near": "1,2"}, "--near is '1,2'; give three numbers"),
         ({"near": "1,0,2"}, "give numbers above 0"),
         ({"by": "round", "name": "x", "seed": -1}, "--seed is -1; give 0 or more"),
+        ({"test_share": 0.25}, "--test-share, --seed and --with-recovered belong to --by"),
+        ({"seed": 0}, "belong to --by"),
+        ({"with_recovered": True}, "belong to --by"),
     ],
 )
 def test_bad_options_are_refused(dataset: Path, options: dict[str, Any], what: str) -> None:

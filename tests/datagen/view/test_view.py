@@ -28,6 +28,7 @@ from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.view import rerun as rerun_log
 from datagen.view.contents import Contents
 from datagen.view.html_page import page
+from tests.datagen.commands import datagen_here
 from tests.datagen.conftest import FRAMES, Samples
 
 Refused = Callable[..., str]
@@ -290,3 +291,10 @@ def test_foxgloves_layout_places_exactly_the_panels_it_configures() -> None:
     content = layout()
     placed = [text for text in strings(content["layout"]) if "!" in text]
     assert sorted(placed) == sorted(content["configById"])
+
+
+def test_a_port_is_refused_without_web(dataset: Path) -> None:
+    path = dataset / "rounds" / "r000.mcap"
+    done = datagen_here("view", path, "--port", "9090", "--html", dataset.parent / "a.html")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "--port is the port of --web; give both, or none" in done.stderr

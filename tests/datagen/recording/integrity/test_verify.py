@@ -16,6 +16,7 @@ from datagen.recording.mcap.scan import scan
 from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.schema import topics
 from datagen.recording.splits import Split, split_path, write_split
+from tests.datagen.commands import datagen_here
 from tests.datagen.conftest import Samples
 
 
@@ -281,3 +282,9 @@ def test_the_datasets_hash_is_in_the_report(dataset: Path) -> None:
 
 def _other_than_state(problems: Iterable[str]) -> list[str]:
     return [problem for problem in problems if "no state file" not in problem]
+
+
+def test_tracks_are_refused_without_replay(dataset: Path) -> None:
+    done = datagen_here("verify", dataset, "--tracks-dir", dataset)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "--tracks-dir has the tracks of --replay; give --replay N, too" in done.stderr
