@@ -39,6 +39,7 @@ ROUND_NAME, TAIL_BYTES = (
     1 << 16,
 )  # name of a round's metadata record, which is at the file's start or in its index
 SQLITE_START = b"SQLite format 3\0"
+ZSTD_START = b"\x28\xb5\x2f\xfd"
 BAG_METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
 HEAD_BYTES = 400
 IMAGE_STARTS = (
@@ -67,6 +68,8 @@ def kind_of(path: Path) -> SourceKind | None:
         return SourceKind.ROUND if is_round else SourceKind.RECORDING
     if head.startswith(SQLITE_START):
         return SourceKind.RECORDING
+    if head.startswith(ZSTD_START):
+        return SourceKind.RECORDING if compressed_bag_files(path) else None
     found = _kind_of_content(head)
     if found is SourceKind.IMAGE and suffix in MJPEG:
         return SourceKind.FILM
@@ -100,3 +103,14 @@ def bag_metadata(folder: Path) -> dict[str, Any] | None:
         if isinstance(found, dict) and isinstance(found.get(BAG), dict):
             return dict(found[BAG])
     return None
+
+
+def compressed_bag_files(path: Path) -> list[str]:
+    """Return the names of all files of the compressed ROS 2 bag to which the file `path` belongs;
+    empty if it belongs to none. The messages or the files of such a bag are compressed."""
+    about = bag_metadata(path.parent) or {}
+    mode, listed = about.get("compression_mode"), about.get("relative_file_paths")
+    if not isinstance(listed, list) or str(mode or "none").lower() == "none":
+        return []
+    names = [Path(str(name)).name for name in listed]
+    return names if path.name in names else []

@@ -191,6 +191,12 @@ UNREAD = tuple(
         ("an SVG drawing", SAVE, rb"\s*<.*<svg|\s*<svg"),
         ("an XML file", "give an image", rb"\s*<\?xml"),
         ("an archive (ZIP, gzip, 7z)", "unpack it", rb"PK\x03\x04|\x1f\x8b|7z\xbc\xaf\x27\x1c"),
+        (
+            "a file compressed with Zstandard",
+            "if it is part of a ROS 2 bag, give the folder of the bag; otherwise unpack it",
+            rb"\x28\xb5\x2f\xfd",
+        ),
+        ("a ROS 1 bag", "convert it to a ROS 2 bag with `rosbags-convert`", rb"#ROSBAG"),
         ("a recorded round (MCAP)", "give it the suffix .mcap", rb"\x89MCAP0"),
         ("a NumPy array", SAVE, rb"\x93NUMPY"),
         (

@@ -17,7 +17,12 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from mtlnet.sources.kinds import BAG_METADATA, SQLITE_START, bag_metadata
+from mtlnet.sources.kinds import (
+    BAG_METADATA,
+    SQLITE_START,
+    bag_metadata,
+    compressed_bag_files,
+)
 from mtlnet.sources.recordings.cut_database import CutDatabase
 from mtlnet.sources.recordings.topic import Topic
 from trackfeatures.errors import UserError
@@ -53,6 +58,13 @@ def open_container(path: Path) -> Container:
         # Before version 4 the paths started with the folder's name.
         names = [Path(str(name)).name for name in about.get("relative_file_paths", [])]
         return McapFiles(path, [path / name for name in names])
+    if files := compressed_bag_files(path):
+        if len(files) > 1:
+            raise UserError(
+                f"{path} is one of {len(files)} files of a compressed bag; give the folder of the "
+                f"bag, {path.parent}"
+            )
+        return _rosbags(path.parent, [])
     with path.open("rb") as file:
         is_sqlite = file.read(len(SQLITE_START)) == SQLITE_START
     return _rosbags(path, [path]) if is_sqlite else McapFiles(path, [path])

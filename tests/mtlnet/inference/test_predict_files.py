@@ -186,6 +186,8 @@ def test_a_size_that_does_not_fit_the_memory_is_refused_by_its_header(
         (b"hello, this is text", "19 bytes that begin with b'hello, t'"),
         (b"\xff\x0a\xfa\x1f", "JPEG XL"),
         (b"\x93NUMPY", "NumPy"),
+        (b"\x28\xb5\x2f\xfd\x04", "Zstandard; .*give the folder of the bag"),
+        (b"#ROSBAG V2.0\n", "a ROS 1 bag; convert it"),
     ],
 )
 def test_a_kind_that_is_not_read_is_named(body: bytes, named: str, tmp_path: Path) -> None:

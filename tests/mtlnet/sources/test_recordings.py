@@ -77,7 +77,8 @@ def test_bags_and_foxglove_files_give_the_answers_of_a_folder(
         write_foxglove(tmp_path / "protobuf.mcap", foxglove),
         write_foxglove(tmp_path / "json.mcap", foxglove, as_json=True),
     ]
-    made += [next(made[0].glob("*.mcap")), next(made[1].glob("*.db3"))]  # a file of a bag
+    for bag, suffix in zip(made[:4], ("mcap", "db3", "mcap", "zstd"), strict=True):
+        made.append(next(bag.glob(f"*.{suffix}")))  # a file of a bag
     for path in made:
         assert find_sources([str(path)])[0].count == COUNT
         rows = predict_files(engine, [str(path)])
@@ -85,6 +86,19 @@ def test_bags_and_foxglove_files_give_the_answers_of_a_folder(
         assert [row["image"] for row in rows] == [f"{path}#{n}" for n in range(COUNT)]
         times = [row["time_s"] - START_S for row in rows]  # from the header, not the log
         assert times == pytest.approx([0.05 * n for n in range(COUNT)], abs=1e-6)
+
+
+def test_one_of_several_files_of_a_compressed_bag_is_refused(
+    engine: BrightnessEngine, tmp_path: Path
+) -> None:
+    ros = [(CAMERA, "CompressedImage", ros_compressed(data)) for data in jpegs()]
+    bag = write_bag(tmp_path / "bag", ros, StoragePlugin.SQLITE3, CompressionMode.FILE)
+    (file,) = bag.glob("*.zstd")
+    about = bag / "metadata.yaml"
+    about.write_text(about.read_text().replace(f"- {file.name}", f"- {file.name}\n  - b.db3", 1))
+    message = r"is one of 2 files of a compressed bag; give the folder of the bag, .*/bag$"
+    with pytest.raises(UserError, match=message):
+        predict_files(engine, [str(file)])
 
 
 def test_raw_pictures_give_the_answers_of_lossless_files(
