@@ -33,11 +33,16 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for cell in notebook.cells:
         for old, new in SMALL.items():
             cell.source = cell.source.replace(old, new)
+    earlier = [tmp_path / folder / "quickstart" / "old" for folder in ("datasets", "runs")]
+    for file in earlier:  # of a run with other settings, which must not be shown again
+        file.parent.mkdir(parents=True)
+        file.touch()
     where = {"metadata": {"path": str(tmp_path)}}
     with sockets:
         NotebookClient(
             notebook, timeout=300, kernel_name="python3", resources=where, config=over_files
         ).execute()
+    assert not any(file.exists() for file in earlier)
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     printed = "".join(output.text for output in outputs if output.output_type == "stream")
     assert "100 train frames, 50 test frames" in printed
