@@ -8,6 +8,7 @@ Every machine needs this program, and the track files unless they are the projec
 
 import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from os import cpu_count
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
+from uuid import uuid4
 
 from datagen.execution.retry import Failure, OnMessage, RetryQueue, Timeouts
 from datagen.recorder.job import AttemptFailed, FramesDone, Job, Outcome, RoundDone, attempt
@@ -26,11 +28,13 @@ POLL_S = 0.5
 
 
 class Recorder:
-    """The Ray actor. Its main thread records; another thread answers `heartbeat`."""
+    """The Ray actor. Its main thread records; another thread answers `heartbeat`. The names of its
+    temporary folders begin with `prefix`."""
 
-    def __init__(self) -> None:
+    def __init__(self, prefix: str) -> None:
         from datagen.recorder.job import warm_up
 
+        self._prefix = prefix
         self._heartbeats = 0
         self._frames = 0
         warm_up()
@@ -38,7 +42,7 @@ class Recorder:
     def record(self, job: Job) -> tuple[Outcome, bytes]:
         """Try to record a round. Returns the outcome and the file's bytes (empty on failure)."""
         self._frames = 0
-        with tempfile.TemporaryDirectory(prefix="datagen-") as home:
+        with tempfile.TemporaryDirectory(prefix=self._prefix) as home:
             prepare(Path(home))
             ending = attempt(replace(job, folder=Path(home)), self._report)
             if not isinstance(ending, RoundDone):
@@ -86,6 +90,7 @@ class RayPool:
         self._timeouts = timeouts or Timeouts()
         self._slots: list[ActorSlot] = []
         self._queue = RetryQueue((), self._timeouts, on_message)
+        self._prefix = f"datagen-{uuid4().hex}-"
 
     def run(self, jobs: Iterable[Job]) -> list[Failure]:
         """Record the rounds of `jobs`; return the rounds that could not be recorded.
@@ -111,6 +116,7 @@ class RayPool:
             self._slots = []
             if started_here:
                 self._ray.shutdown()
+            self._remove_temporary_folders()
         return self._queue.failures
 
     def _connect(self) -> bool:
@@ -143,7 +149,12 @@ class RayPool:
             concurrency_groups={"heartbeat": 1},
             runtime_env={"env_vars": thread_limits(cpu_count() or 1)},
         )(Recorder)
-        return ActorSlot(recorder.remote())
+        return ActorSlot(recorder.remote(self._prefix))
+
+    def _remove_temporary_folders(self) -> None:
+        """Remove the folders that killed actors have left on this machine."""
+        for folder in Path(tempfile.gettempdir()).glob(f"{self._prefix}*"):
+            shutil.rmtree(folder, ignore_errors=True)
 
     def _assign(self) -> bool:
         for slot in self._slots:

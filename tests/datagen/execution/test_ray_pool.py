@@ -1,6 +1,7 @@
 """Rounds recorded on a Ray cluster equal those of local processes."""
 
 import json
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
@@ -37,8 +38,14 @@ def test_two_ray_workers_give_the_same_dataset(collected: Path, tmp_path: Path) 
 
 
 @pytest.mark.extended
-def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
+def test_the_round_of_a_dead_actor_is_retried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ray = pytest.importorskip("ray")
+    (temporary := tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("RAY_TMPDIR", tempfile.gettempdir())  # Ray's sockets need a short path
+    monkeypatch.setenv("TMPDIR", str(temporary))  # of the actors
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))  # of this process
     done: list[str] = []
     killed: list[str] = []
 
@@ -46,6 +53,7 @@ def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
         if isinstance(message, RoundDone):
             done.append(message.state.id)
         elif message.frames and not killed:
+            assert list(temporary.glob("datagen-*"))
             killed.append(message.round_id)
             ray.kill(pool._slots[0].actor)
 
@@ -53,6 +61,7 @@ def test_the_round_of_a_dead_actor_is_retried(tmp_path: Path) -> None:
     assert pool.run(make_jobs(tmp_path, rounds=1, frames=600)) == []
     assert killed == done == ["round-000"] == list(read_states(tmp_path))
     assert not ray.is_initialized()
+    assert not list(temporary.glob("datagen-*"))
 
 
 @pytest.mark.parametrize("address", [None, "ray.example:6379"])
