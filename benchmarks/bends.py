@@ -1,11 +1,15 @@
 """Errors of a model's angle in bends of random roads, by radius and change of curvature.
 
-Run: `python benchmarks/bends.py [--model default] [--views 1] [--roads 20] [--json FILE]`.
-A car at rest stands at even distances on the middle of random roads, parallel to the road, in clear
-light, without traffic. The roads have one lane of 4 m. Their seeds start at `--seed`; no training
-uses them. A pose is steady if the curvature from the car to 8 m ahead changes by at most
-15 % (or 0.0005 1/m). The radius of a pose is that of the sharpest curvature on these 8 m. The bias
-along the bend is the mean error, positive if the answer turns farther into the bend than the road.
+Run: `python benchmarks/bends.py [--model default] [--views 1] [--roads 20] [--turned-m 0]
+[--json FILE]`.
+A car at rest stands at even distances on the middle of random roads, in clear light, without
+traffic. It is parallel to the road or, with `--turned-m M`, turned out of the bend by M times the
+curvature: a car that drives along a bend slowly is turned by about 1.2 m times the curvature,
+because its centre of gravity is in front of its rear axle. The roads have one lane of 4 m. Their
+seeds start at `--seed`; no training uses them. A pose is steady if the curvature from the car to
+8 m ahead changes by at most 15 % (or 0.0005 1/m). The radius of a pose is that of the sharpest
+curvature on these 8 m. The bias along the bend is the mean error, positive if the answer exceeds
+the true angle in the direction of the bend.
 Claim: mean absolute errors of steady poses and of poses at a change of curvature as in `CLAIM`, and
 biases of at most a third of these.
 """
@@ -52,6 +56,7 @@ def main(
     roads: int = 20,
     seed: int = 771_000,
     spacing: float = 12.0,
+    turned_m: float = 0.0,
     json: Path | None = None,
 ) -> None:
     engine = load_engine(resolve_run(model), precision="f32", views=views)
@@ -61,14 +66,16 @@ def main(
         camera = open_camera(road, engine.card.camera, light="clear", seed=seed + number)
         try:
             for s in np.arange(0.0, road.track.length_m, spacing).tolist():
-                picture = camera.render(standing_pose(road, s, 0.0), np.zeros((0, 6)))
+                angle = turned_m * road.track.curvature(s)
+                picture = camera.render(standing_pose(road, s, 0.0, angle), np.zeros((0, 6)))
                 answer = decode_outputs(engine(picture)).as_json()["angle_rad"]
-                parts.append((answer, *_bend(road, s)))
+                parts.append((answer - angle, *_bend(road, s)))
         finally:
             camera.close()
     error, curvature, steady = np.array(parts).T
     rows = table(error, curvature, steady > 0)
-    figures = {"model": model, "views": views, "roads": roads, "poses": len(parts), "table": rows}
+    asked = {"model": model, "views": views, "roads": roads, "turned_m": turned_m}
+    figures = {**asked, "poses": len(parts), "table": rows}
     conclude(figures, json, all(row["reached"] is not False for row in rows))
 
 
