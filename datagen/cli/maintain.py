@@ -118,15 +118,25 @@ def recover(
     print_result(asdict(done), as_json, line)
 
 
+SplitName = Annotated[
+    str,
+    typer.Option(
+        help="Name of the split, which is the file DIR/splits/NAME.json: letters, digits, '.', "
+        "'_' and '-'."
+    ),
+]
+Near = Annotated[
+    str,
+    typer.Option(
+        help="Largest differences between near-duplicates, as three numbers separated by commas: m "
+        "along the road, m across the road, degrees of the angle to the road."
+    ),
+]
+
+
 def split(
     folder: DatasetFolder,
-    name: Annotated[
-        str,
-        typer.Option(
-            help="Name of the split, which is the file DIR/splits/NAME.json: letters, digits, '.', "
-            "'_' and '-'."
-        ),
-    ] = "default",
+    name: SplitName = "default",
     by: Annotated[
         str,
         typer.Option(
@@ -153,14 +163,7 @@ def split(
             help="With --by: also assign the rounds that `datagen recover` wrote.",
         ),
     ] = False,
-    near: Annotated[
-        str,
-        typer.Option(
-            help="Largest differences between near-duplicates, as three numbers separated by "
-            "commas: m along the road, m across the road, degrees of the angle to the "
-            "road."
-        ),
-    ] = "0.5,0.1,0.5",
+    near: Near = "0.5,0.1,0.5",
     as_json: AsJson = False,
 ) -> None:
     """Check a split of a dataset into rounds for training and for testing, or create one with --by.
