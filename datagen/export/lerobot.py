@@ -18,6 +18,7 @@ from datagen.export.lerobot_features import IMAGE, Columns, columns, features, t
 from datagen.export.lerobot_stats import Histogram, Stats, column_stats
 from datagen.export.split_sides import Progress, Side
 from datagen.recording.errors import DatasetError
+from datagen.recording.names import PLACED
 from datagen.recording.round_metadata import RoundInfo
 from datagen.view.steps import Step, Steps
 from runtime.files import write_json
@@ -50,6 +51,8 @@ def write(folder: Path, parts: list[Side], camera: CameraParameters, progress: P
 
 
 def _task(info: RoundInfo) -> str:
+    if info.trajectory == PLACED:
+        return "no drive: the car stands at another pose in each frame"
     return f"drive, trajectory: {info.trajectory}"
 
 

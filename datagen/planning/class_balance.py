@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from datagen.driving.placement import placement_share
 from datagen.driving.trajectory import max_offset
 from datagen.planning.config import TrackChoice
 from datagen.planning.plan import RoundPlan
+from datagen.recording.names import PLACED
 from simulator.driving.speed import bend_profile
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
@@ -55,6 +57,7 @@ class _LapProfile:
     is_class: NDArray[np.bool_]  # (3, cells)
     limit: FloatArray  # (cells,), m/s
     cell_m: float
+    placed: FloatArray  # (3,), shares of the classes in a round of the trajectory PLACED
 
 
 class TrackForecast:
@@ -73,6 +76,8 @@ class TrackForecast:
 
     def __call__(self, entry: RoundPlan, starts: FloatArray) -> FloatArray:
         lap = self._lap(entry.track, entry.lanes, entry.lane_width_m)
+        if entry.trajectory == PLACED:
+            return np.tile(lap.placed, (len(starts), 1))
         seconds = lap.cell_m / np.minimum(lap.limit, expected_speed(entry))
         # Time at each cell border, over two laps: a round may end in the lap after its start.
         time = np.concatenate([[0.0], np.cumsum(np.tile(seconds, 2))])
@@ -93,12 +98,19 @@ class TrackForecast:
     def _lap_profile(self, name: str, lanes: int, lane_width_m: float) -> _LapProfile:
         track = self._tracks[name] if name in self._tracks else random_track(name)
         profile = bend_profile(track, max_offset(Road(track, lanes, lane_width_m)))
-        s = (np.arange(len(profile.limit)) + 0.5) * profile.cell_m
-        here, ahead = track.at(s).curvature, track.at(s + tf.LOOK_AHEAD_M).curvature
-        pairs = zip(here.tolist(), ahead.tolist(), strict=True)
-        classes = np.array([tf.classify_heading(now, then) for now, then in pairs])
-        is_class = np.stack([classes == heading for heading in tf.RoadClass])
-        return _LapProfile(is_class, profile.limit, profile.cell_m)
+        share = placement_share(track)
+        placed = _is_class(track, len(share)) @ share
+        is_class = _is_class(track, len(profile.limit))
+        return _LapProfile(is_class, profile.limit, profile.cell_m, placed)
+
+
+def _is_class(track: Track, cells: int) -> NDArray[np.bool_]:
+    """Return a mask (3, cells) of the cells of a lap in which the road has each class."""
+    s = (np.arange(cells) + 0.5) * (track.length_m / cells)
+    here, ahead = track.at(s).curvature, track.at(s + tf.LOOK_AHEAD_M).curvature
+    pairs = zip(here.tolist(), ahead.tolist(), strict=True)
+    classes = np.array([tf.classify_heading(now, then) for now, then in pairs])
+    return np.stack([classes == heading for heading in tf.RoadClass])
 
 
 def expected_speed(entry: RoundPlan) -> float:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from typer import Option
 
 import trackfeatures as tf
-from datagen.recording.names import CODECS, UNSEEN
+from datagen.recording.names import CODECS, POSES, UNSEEN
 from trackfeatures.camera import CameraParameters, stored
 from trackfeatures.errors import UserError
 from trackfeatures.names import require_name
@@ -128,6 +128,15 @@ class CollectConfig:
             "scene."
         ),
     ] = "paper"
+    poses: Annotated[
+        str,
+        Option(
+            help="Poses of the car. driven: the scripted driver drives. placed: in each frame the "
+            "car stands at another random place, offset from the middle and angle to the road; "
+            "bends of a rare radius are more frequent than on the road, and the angle does not "
+            "depend on the curvature."
+        ),
+    ] = "driven"
     prefix: Annotated[
         str,
         Option(
@@ -198,6 +207,7 @@ class CollectConfig:
             ("light", self.lights, all_lights()),
             ("codec", (self.codec,), CODECS),
             ("roads", (self.roads,), ROADS),
+            ("poses", (self.poses,), POSES),
         ):
             if unknown := set(given) - set(known):
                 raise UserError(f"unknown {name} {min(unknown)!r}; choose {', '.join(known)}")
@@ -207,7 +217,7 @@ class CollectConfig:
             raise UserError(f"there is no split {self.split!r} to collect; give {UNSEEN} or none")
 
 
-LATER = {"roads": CollectConfig.roads, "prefix": CollectConfig.prefix}
+LATER = {name: getattr(CollectConfig, name) for name in ("roads", "poses", "prefix")}
 """Defaults of options that did not exist when earlier versions wrote their plans."""
 
 

@@ -16,7 +16,7 @@ from datagen.planning.class_balance import Forecast, balance_starts
 from datagen.planning.config import FRAMES_PER_SCENE, SEEDS_PER_PLAN, CollectConfig, TrackChoice
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.split import choose_test_rounds
-from datagen.recording.names import UNSEEN
+from datagen.recording.names import PLACED, UNSEEN
 from simulator.track.random_roads.road import RANDOM, random_name, random_track
 from simulator.varied.round import VariedRound
 from trackfeatures.camera import CameraParameters
@@ -38,7 +38,8 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
     count = config.rounds
     tracks, lanes = _tracks_and_lanes(config, rng)
     traffic = stratified_shuffle(range(MAX_TRAFFIC + 1), count, rng)
-    trajectories = stratified_shuffle(TRAJECTORIES, count, rng)
+    kinds = (PLACED,) if config.poses == PLACED else TRAJECTORIES
+    trajectories = stratified_shuffle(kinds, count, rng)
     lights = _lights(config, rng)
     speeds = _stratified_uniform(count, rng) * (SPEED_KMH[1] - SPEED_KMH[0]) + SPEED_KMH[0]
     starts = _starts(tracks, rng)

@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trackfeatures as tf
+from datagen.driving.placement import Placement, draw_placements
 from datagen.driving.scripted_driver import ScriptedDriver, SteeringLaw
 from datagen.driving.trajectory import make_course
 from datagen.errors import RoundFailed
 from datagen.planning.plan import RoundPlan, program
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
 from datagen.recording.mcap.writer import RoundWriter
+from datagen.recording.names import MIDDLE, PLACED
 from datagen.recording.round_metadata import RoundHeader
 from simulator.camera import Camera, Light
 from simulator.camera.overlay import marking_polylines
@@ -65,6 +67,9 @@ class RoundSimulation:
     plan: RoundPlan
     world: World
     driver: ScriptedDriver
+    placements: list[Placement] = field(default_factory=list)
+    """The pose of the car in each frame of a round of the trajectory PLACED; otherwise empty."""
+    frame: int = 0
     driven_m: float = 0.0
     laps: int = 0
     resets: int = 0
@@ -75,8 +80,11 @@ class RoundSimulation:
 
     def __post_init__(self) -> None:
         self.sceneries = [scenery(self.plan, k) for k in range(len(self.plan.lights))]
-        start = self.plan.start * self.world.road.track.length_m
-        self._start(start, self.driver.offset_at(0.0))
+        if self.placements:
+            self._place(self.placements[0])
+        else:
+            start = self.plan.start * self.world.road.track.length_m
+            self._start(start, self.driver.offset_at(0.0))
 
     def scenery_at(self, frame: int) -> Scenery:
         """Return the scenery (seed, light and look of the road) of frame `frame` (from 0) of the
@@ -88,6 +96,18 @@ class RoundSimulation:
     def command(self) -> Command:
         """Return the driver's command for the next control step."""
         return self.driver.command(self.state, self.world.traffic, self.driven_m)
+
+    def advance(self, command: Command) -> None:
+        """Advance to the next frame. `command` is the driver's command for the current state, the
+        result of `command()`. A round of the trajectory PLACED ends in its last frame."""
+        self.frame += 1
+        if self.placements:
+            if self.frame < len(self.placements):
+                self._place(self.placements[self.frame])
+            return
+        self.step(command)
+        for _ in range(self.plan.steps_per_frame - 1):
+            self.step(self.command())
 
     def step(self, command: Command) -> None:
         """Do one control step. If the car then has collided, is off the road or drives backwards,
@@ -110,6 +130,16 @@ class RoundSimulation:
                 )
             self._start(self.state.s, 0.0)
             self.driver.restart()
+
+    def _place(self, pose: Placement) -> None:
+        """Put the car at rest at `pose`, among other traffic than in the frame before."""
+        self.state = self.world.reset(
+            seed=self.plan.seed + self.frame * SCENERY_SEED_STRIDE,
+            s=pose.s,
+            to_middle=pose.to_middle,
+            angle=pose.angle,
+        )
+        self.driver.restart()
 
     def _start(self, s: float, to_middle: float) -> None:
         self.state = self.world.reset(
@@ -162,7 +192,7 @@ def record_round(
                 laps=simulation.laps,
                 resets=simulation.resets,
                 distance_m=round(simulation.driven_m, 3),
-                mean_speed_kmh=round(3.6 * simulation.speed_sum / simulation.steps, 3),
+                mean_speed_kmh=round(3.6 * simulation.speed_sum / max(simulation.steps, 1), 3),
             )
 
 
@@ -209,7 +239,9 @@ def open_simulation(
     road = Road(track, plan.lanes, plan.lane_width_m, carriageway)
     speed = plan.speed_kmh / 3.6
     longest = plan.frames / plan.frequency_hz * speed * 1.1 + 50.0
-    course = make_course(plan.trajectory, road, longest, np.random.default_rng([plan.seed, 3]))
+    rng, placed = np.random.default_rng([plan.seed, 3]), plan.trajectory == PLACED
+    course = make_course(MIDDLE if placed else plan.trajectory, road, longest, rng)
+    placements = draw_placements(road, plan.frames, rng) if placed else []
     control_hz = plan.frequency_hz * plan.steps_per_frame
     seed, light, look = scenery(plan, 0)
     with (
@@ -220,7 +252,7 @@ def open_simulation(
     ):
         law = None if make_law is None else make_law(plan, world, camera)
         driver = ScriptedDriver(road, course, speed, control_hz, law=law)
-        yield RoundSimulation(plan, world, driver), camera
+        yield RoundSimulation(plan, world, driver, placements), camera
 
 
 def _header(plan: RoundPlan, plan_hash: str, road: Road) -> RoundHeader:
@@ -262,9 +294,7 @@ def _next_frame(
         traffic=world.traffic.poses(),
         markings=tuple(marking_polylines(camera, road, (now.s, pose), MARKING_LENGTH_M)),
     )
-    simulation.step(command)
-    for _ in range(simulation.plan.steps_per_frame - 1):
-        simulation.step(simulation.command())
+    simulation.advance(command)
     return FrameTruth(scene, pose, frame)
 
 
