@@ -10,11 +10,16 @@ seeds start at `--seed`; no training uses them. A pose is steady if the curvatur
 8 m ahead changes by at most 15 % (or 0.0005 1/m). The radius of a pose is that of the sharpest
 curvature on these 8 m. The bias along the bend is the mean error, positive if the answer exceeds
 the true angle in the direction of the bend.
+The road below the car is not in the picture: the first visible point of the road is 2.5 m ahead of
+the centre of gravity. So each row also has the mean absolute error of an answer that knows the
+visible road exactly and assumes that its first curvature continues back to the car
+(`visible_rad`).
 Claim: mean absolute errors of steady poses and of poses at a change of curvature as in `CLAIM`, and
 biases of at most a third of these.
 """
 
 import sys
+from math import radians, tan
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +37,7 @@ from simulator.camera.snapshot import standing_pose
 from simulator.track.catalogue import find_track
 from simulator.track.random_roads.road import random_name
 from simulator.track.road import Road
+from trackfeatures.camera import CameraParameters
 
 FloatArray = NDArray[np.float64]
 
@@ -60,7 +66,7 @@ def main(
     json: Path | None = None,
 ) -> None:
     engine = load_engine(resolve_run(model), precision="f32", views=views)
-    parts = []
+    parts, hidden_m = [], first_visible_m(engine.card.camera)
     for number in range(roads):
         road = Road(find_track(random_name(seed + number)))
         camera = open_camera(road, engine.card.camera, light="clear", seed=seed + number)
@@ -69,11 +75,12 @@ def main(
                 angle = turned_m * road.track.curvature(s)
                 picture = camera.render(standing_pose(road, s, 0.0, angle), np.zeros((0, 6)))
                 answer = decode_outputs(engine(picture)).as_json()["angle_rad"]
-                parts.append((answer - angle, *_bend(road, s)))
+                unknown = hidden_turn(road, s, hidden_m)
+                parts.append((answer - angle, *_bend(road, s), unknown))
         finally:
             camera.close()
-    error, curvature, steady = np.array(parts).T
-    rows = table(error, curvature, steady > 0)
+    error, curvature, steady, unknown = np.array(parts).T
+    rows = table(error, curvature, steady > 0, unknown)
     asked = {"model": model, "views": views, "roads": roads, "turned_m": turned_m}
     figures = {**asked, "poses": len(parts), "table": rows}
     conclude(figures, json, all(row["reached"] is not False for row in rows))
@@ -89,14 +96,34 @@ def _bend(road: Road, s: float) -> tuple[float, float]:
     return sharpest, float(np.ptp(found) <= max(0.15 * abs(sharpest), 5e-4))
 
 
+def first_visible_m(camera: CameraParameters) -> float:
+    """Return the distance (m) from the centre of gravity to the first visible point of a flat road,
+    for a camera whose centre row is horizontal."""
+    return camera.x + camera.height_above_road_m / tan(radians(camera.fov_y_deg / 2))
+
+
+def hidden_turn(road: Road, s: float, hidden_m: float) -> float:
+    """Return the error (rad) of the direction of the road at `s` if it is computed from the visible
+    road: its direction and its curvature `hidden_m` m ahead, which is assumed to be constant from
+    there back to `s`."""
+    length = road.track.length_m
+    places = np.linspace(0.0, hidden_m, 28)
+    found = np.array([road.track.curvature((s + x) % length) for x in places.tolist()])
+    return float(found[-1] * hidden_m - np.trapezoid(found, places))
+
+
 def table(
-    error: FloatArray, curvature: FloatArray, steady: NDArray[np.bool_]
+    error: FloatArray,
+    curvature: FloatArray,
+    steady: NDArray[np.bool_],
+    unknown: FloatArray,
 ) -> list[dict[str, Any]]:
     """Return a row for each class of radius, steady or not: number of poses, mean absolute error
-    and bias along the bend (rad), and whether the claim was reached (None: too few poses).
+    and bias along the bend (rad), the mean absolute error from the visible road alone (rad), and
+    whether the claim was reached (None: too few poses).
 
     `error` (N,): answered minus true angle, rad; `curvature` (N,): sharpest curvature, 1/m;
-    `steady` (N,).
+    `steady` (N,); `unknown` (N,): results of `hidden_turn`, rad.
     """
     radius = 1 / np.maximum(np.abs(curvature), 1e-9)
     number = np.searchsorted(-np.array(LIMITS_M), -radius, side="right")
@@ -110,7 +137,9 @@ def table(
                 mean = float(np.abs(error[here]).mean())
                 bias = float((error[here] * np.sign(curvature[here])).mean())
                 good = mean <= claim and abs(bias) <= SHARE_OF_BIAS * claim
+                visible = float(np.abs(unknown[here]).mean())
                 row |= {"mean_rad": round(mean, 4), "bias_rad": round(bias, 4), "claim_rad": claim}
+                row["visible_rad"] = round(visible, 4)
                 if here.sum() >= MIN_POSES:
                     row["reached"] = good
             rows.append(row)
