@@ -1,10 +1,8 @@
 // A controller in C++: drives one lap on the answers of the perception service. POSIX alone.
-//
 //     simulator link --track oval --camera 280x210 --name /driverview &
 //     serve &
 //     simulator link --header driverview_link.h
 //     g++ -std=c++17 -O2 -I. -o drive examples/drive.cpp && ./drive /driverview 127.0.0.1 8000
-//
 // Images and the car's own speeds come through shared memory; the service gets each image as raw
 // pixels (/v2, Open Inference Protocol). State feedback steers; throttle and gear are held. The true
 // offset in the link is read for the printed figures only.
@@ -19,14 +17,17 @@
 // m left of the lane's centre, NaN where no lane is seen; rad, positive when the car points right.
 struct Road { float offset, angle; };
 
-// A connection to the first address of `host` that answers.
+// A connection to the first address of `host` that answers; each operation may take 5 s.
 static int dial(const char *host, const char *port) {
     addrinfo hints{}, *found = nullptr;
     hints.ai_socktype = SOCK_STREAM;
     if (getaddrinfo(host, port, &hints, &found)) throw std::runtime_error("unknown host");
     int connection = -1, yes = 1;
+    const timeval limit{5, 0};
     for (const addrinfo *at = found; at && connection < 0; at = at->ai_next) {
         connection = socket(at->ai_family, at->ai_socktype, at->ai_protocol);
+        for (const int each : {SO_SNDTIMEO, SO_RCVTIMEO})
+            setsockopt(connection, SOL_SOCKET, each, &limit, sizeof limit);
         if (connection < 0 || !connect(connection, at->ai_addr, at->ai_addrlen)) continue;
         close(connection), connection = -1;
     }
@@ -36,17 +37,18 @@ static int dial(const char *host, const char *port) {
     return connection;
 }
 
-// The request for one image; its pixels follow.
+// The request for one image, with the token in $DRIVERVIEW_TOKEN if it is set; its pixels follow.
 static std::string request_for(const drvlink_header &camera, const std::string &host) {
-    const std::string width = std::to_string(camera.image_width);
-    const std::string height = std::to_string(camera.image_height);
-    const size_t bytes = size_t{3} * camera.image_width * camera.image_height;
+    const auto height = camera.image_height, width = camera.image_width;
+    const size_t bytes = size_t{3} * width * height;
+    const char *token = getenv("DRIVERVIEW_TOKEN");
     const std::string json =
-        R"({"inputs":[{"name":"pixels","datatype":"UINT8","shape":[1,)" + height + "," + width +
-        R"(,3],"parameters":{"binary_data_size":)" + std::to_string(bytes) + R"(}}],"outputs":[)"
-        R"({"name":"to_lane_centre_m","parameters":{"binary_data":true}},)"
-        R"({"name":"angle_rad","parameters":{"binary_data":true}}]})";
+        R"({"inputs":[{"name":"pixels","datatype":"UINT8","shape":[1,)" + std::to_string(height) +
+        "," + std::to_string(width) + R"(,3],"parameters":{"binary_data_size":)" +
+        std::to_string(bytes) + R"(}}],"outputs":[{"name":"to_lane_centre_m",)"
+        R"("parameters":{"binary_data":true}},{"name":"angle_rad","parameters":{"binary_data":true}}]})";
     return "POST /v2/models/track/infer HTTP/1.1\r\nHost: " + host +
+           (token ? std::string("\r\nAuthorization: Bearer ") + token : "") +
            "\r\nContent-Type: application/octet-stream\r\nInference-Header-Content-Length: " +
            std::to_string(json.size()) + "\r\nContent-Length: " +
            std::to_string(json.size() + bytes) + "\r\nConnection: close\r\n\r\n" + json;

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import socket
 import subprocess
 from collections.abc import Iterator
 from importlib.resources import files
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from controllers.demo.process import free_port, running_service
+from serve.config import Limits
 from simulator.track.road import Road
 from simulator.track.toml_track import read_toml_track
 from tests.serve.conftest import FakeEngine, outputs, serving
@@ -20,6 +22,7 @@ from tests.simulator.link.conftest import fresh_name, start_server, stop
 SOURCE = Path(__file__).parents[2] / "examples" / "drive.cpp"
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
 LAP_LIMIT_S = 240.0
+TOKEN = "0123456789abcdef"
 MAX_LINES = 105
 HEAD = 'look = "countryside"\nsurface = "asphalt"\nwidth = 12.0\n'
 STRAIGHT = '[[segment]]\ntype = "straight"\nlength = 40.0\n'
@@ -143,6 +146,23 @@ def test_it_asks_ipv6_and_every_address_of_a_name(
     with serving(turn, host=listens) as service:
         done = drive(program, link, asked, service.port, **two_addresses)
     assert done.stderr == "error: the car has left the road\n"
+
+
+@pytest.mark.slow
+def test_it_sends_the_token_of_the_environment(program: Path, link: str) -> None:
+    turn = FakeEngine(lambda _image: outputs((-2.0, 2.0, np.nan, np.nan, np.nan), 0.5))
+    with serving(turn, limits=Limits(token=TOKEN)) as service:
+        refused = drive(program, link, "127.0.0.1", service.port)
+        done = drive(program, link, "127.0.0.1", service.port, DRIVERVIEW_TOKEN=TOKEN)
+    assert "error: no answer: HTTP/1.1 401" in refused.stderr
+    assert done.stderr == "error: the car has left the road\n"
+
+
+@pytest.mark.slow
+def test_a_service_that_hangs_ends_it_with_one_line(program: Path, link: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        done = drive(program, link, "127.0.0.1", silent.getsockname()[1])
+    assert (done.returncode, done.stderr) == (1, "error: no answer: \n")
 
 
 def test_it_is_short() -> None:
