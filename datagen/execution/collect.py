@@ -7,7 +7,7 @@ datagen collect --rounds 60 --out datasets/default
 
 import json
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -30,9 +30,8 @@ from datagen.recording.folder import (
     round_path,
     write_if_changed,
 )
-from datagen.recording.manifest import planned_split, rebuild
-from datagen.recording.names import SIDES
-from datagen.recording.splits import Split, read_split, split_path, write_split
+from datagen.recording.manifest import current_split, rebuild
+from datagen.recording.splits import split_path, write_split
 
 if TYPE_CHECKING:
     from datagen.recorder.record import MakeLaw
@@ -125,26 +124,7 @@ def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str |
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
         if not finished or (shard is not None and len(finished) < len(plan.rounds)):
             return None
-        return str(rebuild(folder, _current_split(folder, plan, finished))["content_hash"])
-
-
-def _current_split(folder: Path, plan: Plan, listed: Collection[str]) -> Split:
-    """Return the split of the plan, with only the rounds whose ids are in `listed`; or, if the user
-    has replaced it (for example with `datagen split --by track`), the split in `folder`, also with
-    only these rounds."""
-    planned = planned_split(folder, sides_of(plan), listed)
-    try:
-        found = read_split(split_path(folder))
-    except DatasetError:
-        return planned
-    named = {i for side in SIDES for i in getattr(found, side)}
-    moved = any(found.side(i) != planned.side(i) for i in named.intersection(listed))
-    left_out = read_states(folder).keys() & sides_of(plan).keys() - named - {*planned.recovered}
-    if not moved and not left_out:
-        return planned
-    sides = {side: tuple(i for i in getattr(found, side) if i in listed) for side in SIDES}
-    recovered = dict.fromkeys((*found.recovered, *planned.recovered))
-    return Split(**sides, recovered=tuple(i for i in recovered if i in named and i in listed))
+        return str(rebuild(folder, current_split(folder, sides_of(plan), finished))["content_hash"])
 
 
 def _failure_message(failures: Sequence[Failure], planned: int) -> str:
@@ -257,7 +237,7 @@ def initialise_folder(folder: Path, plan: Plan) -> None:
     write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
     sides = sides_of(plan)
-    write_split(split_path(folder), _current_split(folder, plan, sides))
+    write_split(split_path(folder), current_split(folder, sides, sides))
 
 
 def sides_of(plan: Plan) -> dict[str, str]:

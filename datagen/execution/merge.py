@@ -24,6 +24,7 @@ from datagen.recording.folder import (
     discard_partials,
     end_merge,
     is_unstarted,
+    merging_rounds,
     partial_path,
     prepare,
     publish,
@@ -31,7 +32,7 @@ from datagen.recording.folder import (
     round_path,
     write_if_changed,
 )
-from datagen.recording.manifest import planned_split, rebuild
+from datagen.recording.manifest import current_split, rebuild
 from datagen.recording.mcap.index import open_round
 from runtime.files import file_hash
 from trackfeatures.camera import CameraParameters
@@ -119,7 +120,7 @@ def _copy_rounds(
     state of each round by id. Readers refuse the dataset until its split lists the copied
     rounds."""
     if round_ids:
-        begin_merge(out)
+        begin_merge(out, set(round_ids) - read_states(out).keys())
     for round_id in round_ids:
         _copy_round(*found[round_id], out)
 
@@ -132,7 +133,7 @@ def _derive(out: Path, planned: Mapping[str, str]) -> tuple[dict[str, RoundState
     if not states:
         end_merge(out)
         raise DatasetError("no folder has a finished round of the plan; record a shard first")
-    return states, rebuild(out, planned_split(out, planned, states))
+    return states, rebuild(out, current_split(out, planned, states, merging_rounds(out)))
 
 
 def _read_plan(folder: Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ files in `rounds/` and `state/`.
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.resources import files
@@ -89,9 +89,22 @@ def is_unstarted(folder: Path, first_file: str) -> bool:
     )
 
 
-def begin_merge(folder: Path) -> None:
-    """Mark the dataset as being merged: rounds are added that its split does not list yet."""
-    atomic_write(folder / MERGING, "", fsync=True)
+def begin_merge(folder: Path, added: Collection[str]) -> None:
+    """Mark the dataset as being merged: the rounds with the ids `added` are added, and its split
+    does not list them yet. The rounds of an interrupted merge stay in the mark."""
+    ids = sorted({*added, *merging_rounds(folder)})
+    atomic_write(folder / MERGING, json.dumps(ids), fsync=True)
+
+
+def merging_rounds(folder: Path) -> list[str]:
+    """Return the ids of the rounds that a merge adds, also an interrupted one; empty if there is
+    none. The mark of an earlier version has no ids: then all finished rounds are returned."""
+    try:
+        return [str(each) for each in json.loads((folder / MERGING).read_text())]
+    except FileNotFoundError:
+        return []
+    except (ValueError, TypeError):
+        return list(read_states(folder))
 
 
 def end_merge(folder: Path) -> None:

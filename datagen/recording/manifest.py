@@ -13,6 +13,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.card import render_card
 from datagen.recording.dataset import Dataset
+from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     PUBLISHED_FILES,
     end_merge,
@@ -21,7 +22,7 @@ from datagen.recording.folder import (
 )
 from datagen.recording.mcap.index import open_round
 from datagen.recording.names import SIDES
-from datagen.recording.splits import Split, split_path, write_split
+from datagen.recording.splits import Split, read_split, split_path, write_split
 from datagen.recording.statistics import describe
 from runtime.files import file_hash
 from trackfeatures.camera import stored
@@ -87,7 +88,41 @@ def manifest_problems(folder: Path) -> Iterator[str]:
         yield f"{path} does not describe the rounds in the folder; {remedy}"
 
 
-def planned_split(folder: Path, side_of: Mapping[str, str], listed: Collection[str]) -> Split:
+def current_split(
+    folder: Path,
+    side_of: Mapping[str, str],
+    listed: Collection[str],
+    added: Collection[str] = (),
+) -> Split:
+    """Return the split of a plan, with only the rounds whose ids are in `listed`; or, if the user
+    has replaced it (for example with `datagen split --by track`), the split in `folder`, also with
+    only these rounds.
+
+    `side_of` contains the side of each planned round by id. `added` are the ids of rounds that the
+    split in `folder` does not know yet; they are on their planned side.
+    """
+    planned = _planned_split(folder, side_of, listed)
+    try:
+        found = read_split(split_path(folder))
+    except DatasetError:
+        return planned
+    named = {i for side in SIDES for i in getattr(found, side)}.difference(added)
+    moved = any(found.side(i) != planned.side(i) for i in named.intersection(listed))
+    known = read_states(folder).keys() & side_of.keys() - set(added)
+    if not moved and not known - named - {*planned.recovered}:
+        return planned
+    sides = {
+        side: (
+            *(i for i in getattr(found, side) if i in listed and i not in added),
+            *(i for i in getattr(planned, side) if i in added),
+        )
+        for side in SIDES
+    }
+    used = {i for ids in sides.values() for i in ids}
+    return Split(**sides, recovered=tuple(i for i in planned.recovered if i in used))
+
+
+def _planned_split(folder: Path, side_of: Mapping[str, str], listed: Collection[str]) -> Split:
     """Return the split of a plan, with only the rounds whose ids are in `listed`.
 
     `side_of` contains the side of each planned round by id. Finished rounds in `folder` that were

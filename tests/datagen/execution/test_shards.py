@@ -274,6 +274,39 @@ def test_a_split_of_the_users_own_stays_when_collected_again(
     assert Dataset.open(folder).content_hash == json.loads(done.stdout)["content_hash"]
 
 
+@pytest.mark.parametrize("killed", ["no", "yes", "earlier version"])
+def test_a_split_of_the_users_own_stays_when_more_rounds_are_merged(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: str
+) -> None:
+    part, out = tmp_path / "part", tmp_path / "out"
+    shutil.copytree(whole, part)
+    for name in ("rounds/round-002.mcap", "state/round-002.json"):
+        (part / name).unlink()
+    merge([part], out)
+    planned = read_split(split_path(whole))
+    before = read_split(split_path(out))
+    write_split(split_path(out), replace(before, train=before.test, test=before.train))
+    if killed != "no":
+        with monkeypatch.context() as patch:
+            patch.setattr("datagen.execution.merge._derive", _killed)
+            with pytest.raises(KeyboardInterrupt):
+                merge([whole], out)
+        assert (out / "rounds/round-002.mcap").exists()
+    if killed == "earlier version":
+        (out / ".merging").write_text("")
+    assert merge([whole], out).rounds == 3
+    split = read_split(split_path(out))
+    assert split.side("round-002") == planned.side("round-002") != ""
+    swapped = {"train": "test", "test": "train"} if killed != "earlier version" else {}
+    for name in ("round-000", "round-001"):
+        assert split.side(name) == swapped.get(planned.side(name), planned.side(name))
+    assert verify(out, "full").ok
+
+
+def _killed(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_a_recovered_round_is_merged(whole: Path, tmp_path: Path) -> None:
     folder, saved = _with_recovered(whole, tmp_path / "data")
     merged = merge([folder], tmp_path / "out")

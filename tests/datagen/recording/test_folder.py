@@ -28,7 +28,7 @@ def test_a_split_is_replaced_atomically_and_an_equal_one_kept(
 
 
 def test_a_merge_that_has_not_ended_is_refused_by_every_reader(dataset: Path) -> None:
-    begin_merge(dataset)
+    begin_merge(dataset, ["r000"])
     with pytest.raises(DatasetError, match="running the same `datagen merge` again"):
         Dataset.open(dataset)
     (problem,) = verify(dataset, "quick").problems
