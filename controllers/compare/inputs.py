@@ -1,13 +1,16 @@
 """The inputs of the drives of a comparison that their cells do not contain: tuned parameters,
-roads, code of controllers, and models."""
+roads, code of controllers and of the simulator, and models."""
 
 import hashlib
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import simulator
+import trackfeatures
 from controllers.compare.cells import Cell
 from controllers.compare.config import CompareConfig
 from controllers.drive.run import read_parameters
@@ -15,6 +18,10 @@ from controllers.perception.sources import ServiceModel, model_identity
 from controllers.registry import controller_code
 from simulator.track.catalogue import find_track
 from trackfeatures.errors import UserError
+
+CODE_SUFFIXES = (".py", ".toml", ".glsl")
+SERVERS = ("link", "watch")
+"""Folders of the simulator that do not change a drive."""
 
 
 def parameters_of(config: CompareConfig, controller: str) -> dict[str, float]:
@@ -61,8 +68,8 @@ def with_resolved_model(config: CompareConfig, todo: list[Cell]) -> CompareConfi
 
 def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
     """Return, for each drive, a hash of the inputs that its cell does not contain: the tuned
-    parameters, the road (for images also its paint and scenery), the controller's files, and what
-    determines the answers of the model or service."""
+    parameters, the road (for images also its paint and scenery), the controller's files, the
+    simulator's files, and what determines the answers of the model or service."""
     tracks = {
         name: find_track(name, config.tracks_dir)
         for name in dict.fromkeys(cell.track for cell in todo)
@@ -79,9 +86,24 @@ def fingerprints(config: CompareConfig, todo: list[Cell]) -> dict[Cell, str]:
     for cell in todo:
         track = tracks[cell.track]
         road = track.driving_hash if cell.perception == "truth" else track.picture_hash
-        used = parameters[cell.controller], road.encode(), code[cell.controller]
+        used = parameters[cell.controller], road.encode(), code[cell.controller], simulator_code()
         codes[cell] = hashlib.sha256(b"".join((*used, models[cell.perception]))).hexdigest()[:16]
     return codes
+
+
+@cache
+def simulator_code() -> bytes:
+    """Return a hash of the files that determine how cars move and what they see: code, tables and
+    shaders of the packages `simulator` (without its servers) and `trackfeatures`."""
+    content = hashlib.sha256()
+    for package in (simulator, trackfeatures):
+        folder = Path(package.__path__[0])
+        for file in sorted(folder.rglob("*")):
+            name = file.relative_to(folder)
+            if file.suffix in CODE_SUFFIXES and name.parts[0] not in SERVERS:
+                content.update(f"{name}\0{file.stat().st_size}\0".encode())
+                content.update(file.read_bytes())
+    return content.digest()
 
 
 def _model_of(config: CompareConfig, perception: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+import simulator
 from controllers import registry
 from controllers.compare import inputs
 from controllers.compare.cells import cells
@@ -25,6 +26,26 @@ class Law:
     def update(self, observation):
         return max(-1.0, min(2 * observation.angle - {gain} * observation.to_lane_centre, 1.0))
 """
+
+
+def test_drives_are_made_again_when_a_file_of_the_simulator_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, original = short(tmp_path, tracks="oval"), simulator.__path__[0]
+    codes = []
+    for changed in ("", "world/world.py", "camera/shaders/road.glsl", "link/server.py"):
+        package = tmp_path / f"copy-{changed.replace('/', '-')}"
+        shutil.copytree(original, package)
+        if changed:
+            with (package / changed).open("a") as file:
+                file.write(" ")
+        monkeypatch.setattr(simulator, "__path__", [str(package)])
+        inputs.simulator_code.cache_clear()
+        codes.append([*fingerprints(config, cells(config)).values()])
+    monkeypatch.undo()
+    inputs.simulator_code.cache_clear()
+    same, *others = codes
+    assert [found == same for found in others] == [False, False, True]
 
 
 @pytest.mark.parametrize("place", ["{}/changing_law.py", "changing_law"])
