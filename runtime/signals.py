@@ -53,8 +53,9 @@ def interrupts(*numbers: int) -> Iterator[Callable[[], bool]]:
     The first signal raises no KeyboardInterrupt, because an interrupt that is raised inside a
     callback, a finaliser or an extension module can be lost: numpy discards a KeyboardInterrupt
     that is raised while it compares a scalar with an IntEnum. The same signal raises
-    KeyboardInterrupt when it arrives a second time. Only the main thread can receive signals; in
-    another thread the function always returns False.
+    KeyboardInterrupt when it arrives a second time, except SIGHUP, which a closing terminal sends
+    twice. SIGHUP stays ignored under `nohup`. Only the main thread can receive signals; in another
+    thread the function always returns False.
     """
     seen: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -63,9 +64,14 @@ def interrupts(*numbers: int) -> Iterator[Callable[[], bool]]:
 
     def note(number: int, _frame: FrameType | None) -> None:
         seen.append(number)
-        signal.signal(number, signal.default_int_handler)
+        again = signal.SIG_IGN if number == signal.SIGHUP else signal.default_int_handler
+        signal.signal(number, again)
 
-    before = {number: signal.signal(number, note) for number in numbers}
+    before = {
+        number: signal.signal(number, note)
+        for number in numbers
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
+    }
     try:
         yield lambda: bool(seen)
     finally:

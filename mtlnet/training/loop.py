@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from signal import SIGINT, SIGTERM
+from signal import SIGHUP, SIGINT, SIGTERM
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ LOG_EVERY = 10
 """Number of steps between two points of the curves."""
 CHECKPOINT_SECONDS = 60.0
 """Time between two checkpoints, s."""
-STOPPING = (SIGINT, SIGTERM)
+STOPPING = (SIGINT, SIGTERM, SIGHUP)
 """Signals that stop a training between two steps."""
 DIVERGED = (
     "training stops and the last good checkpoint is kept; start a new run with smaller --alpha or "
@@ -62,7 +62,7 @@ def train_loop(
     """Train until the iterations or the minutes are used up, and save checkpoints.
 
     `elapsed_s`: seconds trained before this call. `report` is called every ten steps. Raises
-    Stopped after Ctrl-C, UserError when the training diverges.
+    Stopped after Ctrl-C, SIGTERM or SIGHUP, UserError when the training diverges.
     """
     log = CurveLog(config.out, trainer.step_number) if trainer.rank.is_first else None
     begin = time.perf_counter() - elapsed_s

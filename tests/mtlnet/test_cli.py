@@ -122,7 +122,10 @@ def test_wrong_options_of_training_are_refused(dataset: Path, tmp_path: Path) ->
 
 
 @pytest.mark.extended
-def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_a_checkpoint_to_resume_from(
+    dataset: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     run = tmp_path / "run"
     command = ["train", "--data", dataset, "--out", run, "--batch", 2, "--iterations", 2000]
     process = subprocess.Popen(
@@ -131,7 +134,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(dataset: Path, tmp_path: Path
     limit = time.monotonic() + 300
     while not read_curves(run / "curves.csv") and time.monotonic() < limit:
         time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, stderr = process.communicate(timeout=300)
     assert process.returncode == 130, stderr
     assert "--resume" in stderr

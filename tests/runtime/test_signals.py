@@ -37,6 +37,22 @@ def test_a_second_signal_is_raised() -> None:
             signal.raise_signal(signal.SIGUSR1)
 
 
+def test_a_loop_ends_when_its_terminal_is_closed_but_not_under_nohup() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with interrupts(signal.SIGHUP) as interrupted:
+            signal.raise_signal(signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)  # a closing terminal sends two
+            assert interrupted()
+        assert signal.signal(signal.SIGHUP, signal.SIG_IGN) == signal.SIG_DFL
+        with interrupts(signal.SIGHUP) as interrupted:
+            signal.raise_signal(signal.SIGHUP)
+            assert not interrupted()
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_another_thread_is_not_interrupted() -> None:
     answers = []
 
