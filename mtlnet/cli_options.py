@@ -27,7 +27,8 @@ Precision = Annotated[
     str | None,
     typer.Option(
         help="Precision in which OpenVINO computes: int8 (possible after `mtlnet export "
-        "--precision int8`), bf16 or f32 (32-bit float).",
+        "--precision int8`), bf16 or f32 (32-bit float). A CPU without bf16 computes in f32 "
+        "instead of bf16.",
         show_default="int8 if the model has an int8 version that passed the accuracy gate of "
         "`mtlnet export` and is reliable on this CPU, else bf16 if the CPU supports it, else f32",
     ),

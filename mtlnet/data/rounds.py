@@ -30,6 +30,12 @@ def open_training_dataset(path: Path) -> Dataset:
             f"the images of {path} are {camera.width} x {camera.height}, the network takes "
             f"{WIDTH} x {HEIGHT}; collect with the default camera size"
         )
+    if camera.y != 0.0:
+        raise UserError(
+            f"the images of {path} are of a camera {camera.y:g} m beside the middle of the car, "
+            "which a network is not trained on, because training mirrors images; collect with y = "
+            "0: pictures of any camera are warped into the model's camera"
+        )
     if not camera.is_plain:
         raise UserError(
             f"the images of {path} are of a camera ({camera}) with distortion, roll, yaw or a "

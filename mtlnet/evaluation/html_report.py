@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Frames
+from datagen.recording.names import PLACED
 from mtlnet.data.model_labels import round_rectification
 from mtlnet.evaluation.metrics import GROUPS, signed_errors
 from mtlnet.evaluation.tables import error_cells, mean_error_cells
@@ -126,12 +127,14 @@ def _groups(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _drives(frames: Frames, outputs: NDArray[np.float32]) -> Iterator[dict[str, Any]]:
-    """Yield charts of the true and predicted offset and angle in the first round of each track."""
+    """Yield charts of the true and predicted offset and angle in the first drive on each track."""
     shown: set[str] = set()
     for number, info in enumerate(frames.rounds):
         rows = np.flatnonzero(frames.labels.round == number)
         if info.track in shown or len(shown) == MAX_ROUNDS or not len(rows):
             continue
+        if info.trajectory == PLACED:
+            continue  # its frames are no drive
         shown.add(info.track)
         yield {
             "about": f"{info.track}, {info.lanes} lane(s), {info.light} ({info.id})",

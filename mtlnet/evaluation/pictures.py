@@ -145,7 +145,9 @@ def _groups(answers: Answers, name: str) -> Iterator[tuple[str, dict[str, Any]]]
         (picture.file, copy): group_of(answers, name, picture, copy) for picture, copy in cases
     }
     names = sorted({*of_case.values()})
-    for group in [copy for copy in COPIES if copy in names] or names:
+    if name == "by_copy":
+        names.sort(key=COPIES.index)
+    for group in names:
 
         def within(picture: LabelledPicture, copy: str, group: str = group) -> bool:
             return of_case[picture.file, copy] == group

@@ -38,6 +38,7 @@ from mtlnet.uncertainty_fit.head import refit_uncertainty_head
 from runtime.files import atomic_write, require_other_file
 from runtime.html import format_number, format_percent
 from trackfeatures.errors import UserError
+from trackfeatures.names import to_name
 
 PAGE = "README.md"
 PICTURE = "worst.jpg"
@@ -60,8 +61,10 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
     refitted = None if data is None else refit_uncertainty_head(run, data)
     if refitted is not None:
         seeds = Seeds.read(card.data["seeds"]) | Seeds.read(refitted.about["seeds"])
-        seen = {**card.data, "seeds": seeds.entry()}
-        card = replace(card, uncertainty=refitted.about, data=seen)
+        about = dict(refitted.about)
+        tracks = sorted({*card.data["tracks"], *about.pop("tracks")})
+        seen = {**card.data, "seeds": seeds.entry(), "tracks": tracks}
+        card = replace(card, uncertainty=about, data=seen)
     served = load_served(run, replace(card, uncertainty=None) if refitted is not None else card)
     head = served.head if refitted is None else refitted.head
     halves = {name: half(name, t) for name, t in served.network.state_dict().items()}
@@ -69,7 +72,7 @@ def ship_model(run: Path, out: Path, data: Path | None = None) -> dict[str, Any]
     files = write_model(out, card.network, halves, head, narrow=True)
     shipped = replace(
         card,
-        name=out.resolve().name,
+        name=to_name(out.resolve().name),
         data=_without_folders(card.data),
         files=files,
         golden=golden_outputs(load_network(out / WEIGHTS, card.network)),

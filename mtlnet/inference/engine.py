@@ -141,6 +141,8 @@ class OpenVinoEngine:
         self.card = card
         best = best_precision()
         self.precision: Precision = precision or default_precision(run, card)
+        if self.precision == "bf16":
+            self.precision = best  # without bf16 in the processor OpenVINO computes in float32
         quantised = self.precision == "int8"
         options = {
             "INFERENCE_PRECISION_HINT": best if quantised else self.precision,

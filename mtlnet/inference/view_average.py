@@ -45,10 +45,16 @@ def check_count(count: int) -> None:
 
 class Views:
     """Makes `count` views of the images of a camera. Raises UserError for another count than 1, 2
-    or 6."""
+    or 6, and for several views of a camera beside the middle of the car: the mirrored picture is
+    that of a camera on the other side."""
 
     def __init__(self, count: int, camera: CameraParameters) -> None:
         check_count(count)
+        if count > 1 and camera.y != 0.0:
+            raise UserError(
+                f"--views {count}: the model's camera is {camera.y:g} m beside the middle of the "
+                "car, where a mirrored picture has other distances; give --views 1"
+            )
         self.count = count
         self._camera = camera
 

@@ -74,11 +74,11 @@ def find_sources(
 
 def _find(given: str, note: Note, topic: str) -> list[Source]:
     path = Path(given)
-    if is_live(given):
-        return [_stream(given)]
     if not given:  # Path would take it for the current folder
         return [Source(path, problem="the name of an input is empty; give a file or a folder")]
     try:
+        if is_live(given):
+            return [_stream(given)]
         if path.is_dir():
             if bag_metadata(path) is not None:
                 return [_source(path, SourceKind.RECORDING, topic)]

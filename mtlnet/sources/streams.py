@@ -5,6 +5,7 @@ FFmpeg's documentation of protocols describes the addresses and their options. E
 limit: a stream that stalls ends with a fault, and the answers so far are kept.
 """
 
+import os
 import re
 import time
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from mtlnet.sources.pictures import Picture, other_size
 from trackfeatures.errors import UserError
 
 SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "srt", "udp", "tcp", "rtp")
+WEBCAM = re.compile(r"(?:/dev/video)?(\d{1,4})|/dev/video")
 ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 OPEN_S, STALL_S = 10.0, 10.0
 """Time limits, s, for the first picture and for each later picture. The longest usual interval
@@ -33,7 +35,7 @@ DEVICES = Path("/dev")
 def is_live(given: str) -> bool:
     """Return whether an input names a webcam or the address of a stream, and no existing file or
     folder."""
-    if Path(given).is_file() or Path(given).is_dir():
+    if os.path.isfile(given) or os.path.isdir(given):  # noqa: PTH112, PTH113  # Path raises for long names
         return False
     return given.isdecimal() or given.startswith("/dev/video") or bool(ADDRESS.match(given))
 
@@ -43,8 +45,13 @@ def shown_name(given: str) -> str:
     an address without its user and password."""
     if given.isdecimal():
         return f"webcam {given}"
-    parts = urlsplit(given) if ADDRESS.match(given) else None
-    if parts is None or "@" not in parts.netloc:
+    if not ADDRESS.match(given):
+        return given
+    try:
+        parts = urlsplit(given)
+    except ValueError:  # such as brackets that do not match
+        return given.rpartition("@")[2]
+    if "@" not in parts.netloc:
         return given
     return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
 
@@ -128,6 +135,9 @@ def open_stream(given: str) -> Stream:
             f"{name}: streams of kind {scheme[1]} are not read; give one of "
             f"{', '.join(SCHEMES)}, or a file by its path"
         )
+    webcam = WEBCAM.fullmatch(given)
+    if not scheme and webcam is None:
+        raise UserError(f"{name} is no webcam; give its number, 0 to 9999, or /dev/videoNUMBER")
     opened = ExitStack()
     errors = opened.enter_context(decoding_errors())
     limits = [
@@ -135,10 +145,10 @@ def open_stream(given: str) -> Stream:
         cv2.CAP_PROP_READ_TIMEOUT_MSEC, int(1e3 * STALL_S),
     ]  # fmt: skip
     with silent_opencv(), errors.opening():
-        if scheme:
+        if webcam is None:
             film = cv2.VideoCapture(given, cv2.CAP_FFMPEG, limits)
         else:
-            film = cv2.VideoCapture(int(given.removeprefix("/dev/video") or 0), cv2.CAP_V4L2)
+            film = cv2.VideoCapture(int(webcam[1] or 0), cv2.CAP_V4L2)
     opened.callback(film.release)
     if film.isOpened():
         fps = film.get(cv2.CAP_PROP_FPS)

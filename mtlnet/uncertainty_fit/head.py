@@ -154,9 +154,9 @@ def fit_uncertainty_head(
 def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
     """Fit the uncertainty head of the model in `run` again, on the train rounds of a dataset.
 
-    `about` of the result also names the dataset and the seeds of its train rounds. Raises
-    ModelError for images of another camera, and for rounds on which the model was trained, because
-    its errors on them are too small; UserError for a dataset with too few rounds.
+    `about` of the result also names the dataset, and the seeds and tracks of its train rounds.
+    Raises ModelError for images of another camera, and for rounds on which the model was trained,
+    because its errors on them are too small; UserError for a dataset with too few rounds.
     """
     card, dataset = read_card(run), open_training_dataset(data)
     # All rounds are new to the model, so the larger part takes the role of the held-out rounds.
@@ -181,6 +181,7 @@ def refit_uncertainty_head(run: Path, data: Path) -> FittedUncertainty:
         "data": dataset.path.name,
         "content_hash": dataset.content_hash,
         "seeds": Seeds.of(seeds).entry(),
+        "tracks": sorted({info.track for info in (*many.rounds, *few.rounds)}),
     }
     return replace(fitted, about={**fitted.about, **origin})
 

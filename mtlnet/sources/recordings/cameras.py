@@ -56,7 +56,7 @@ def camera_of(message: Any, image_topic: str, mount: CameraParameters) -> Camera
         matrix, distortion = projection.reshape(3, 4)[:, :3], np.zeros(0)
     if matrix.size != 9 or not np.isfinite(matrix).all() or not matrix.ravel()[0] > 0:
         raise UserError("it is not calibrated: its matrix K has no focal length")
-    if is_ros and (message.roi.width or message.roi.height or max(_binning(message)) > 1):
+    if is_ros and (_is_part(message) or max(_binning(message)) > 1):
         raise UserError("its pictures are a part (roi) or are binned, which is not read")
     if not max(map(np.abs, (*matrix.ravel(), *distortion))) <= MAX_NUMBER:
         raise UserError(f"one of its numbers is no number, or above {MAX_NUMBER:g}")
@@ -85,6 +85,15 @@ def _lens(model: str, distortion: Any) -> dict[str, Any]:
     if not distortion.any():
         return {"distortion": "none", "coefficients": ()}
     return read_distortion(model, distortion.tolist())
+
+
+def _is_part(message: Any) -> bool:
+    """Return whether a ROS CameraInfo describes a part of the camera's picture. Its `roi` is 0 or
+    the full size otherwise."""
+    roi = message.roi
+    size = int(roi.width), int(roi.height)
+    full = (0, 0), (int(message.width), int(message.height))
+    return size not in full or bool(roi.x_offset or roi.y_offset)
 
 
 def _binning(message: Any) -> tuple[int, int]:

@@ -67,6 +67,11 @@ def decode_raw(
             f"{', '.join(sorted(LAYOUTS))}",
         )
     check_file_size(width, height)
+    if layout.samples == 2 and width % 2:
+        raise ImageError(
+            Fault.UNSUPPORTED,
+            f"its width of {width} px is odd, and two pixels of {encoding} share their colour",
+        )
     row = width * layout.samples * layout.bytes
     step = step or row
     if step < row or len(data) < step * (height - 1) + row:

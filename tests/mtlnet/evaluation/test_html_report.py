@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording import Dataset, Frames
+from datagen.recording.names import PLACED
 from mtlnet.data.description import mean_labels
 from mtlnet.evaluation.html_report import (
     CAPTION_PX,
@@ -125,6 +126,14 @@ def test_a_round_of_each_track_is_drawn_with_its_band(shown: Page, frames: Frame
     assert len(shown.all("path", "dot")) == sum(
         10 for name in FEATURES if name in ("ml", "mr", "to_lane_centre", "angle", "l", "m", "r")
     )
+
+
+def test_placed_cars_are_not_drawn_as_a_drive(tmp_path: Path, report: dict[str, Any]) -> None:
+    placed = Dataset.open(write_dataset(tmp_path, 300, trajectory=PLACED)).select("all")
+    found = np.zeros((len(placed), 9), np.float32)
+    about = {name: value for name, value in report.items() if name != "uncertainty"}
+    figures = {**about, **evaluate_by_groups(found, placed, mean_labels(placed.labels))}
+    assert not Page(page(figures, placed, found)).all("h3")
 
 
 def test_the_worst_frames_are_the_worst() -> None:

@@ -103,6 +103,13 @@ def test_refused_pictures_count_in_their_groups(images: CustomImages) -> None:
     assert next(case.verdict for case in cases(answers)) == "refused: too narrow"
 
 
+def test_a_drive_with_the_name_of_a_copy_hides_no_other(images: CustomImages) -> None:
+    names = {"one": "plain"}
+    named = (replace(p, drive=names.get(p.drive, p.drive)) for p in images.pictures)
+    figures = picture_report(judged(replace(images, pictures=tuple(named))), MEAN)["pictures"]
+    assert {k: v["cases"] for k, v in figures["by_drive"].items()} == {"plain": 2, "two": 1}
+
+
 def test_the_page_shows_each_picture_failures_first(images: CustomImages, tmp_path: Path) -> None:
     answers = judged(images)
     assert [(case.picture.file, case.verdict) for case in cases(answers)] == [

@@ -83,6 +83,12 @@ def test_it_answers_frames_as_the_run_did(published: Path, shipped: Path, datase
     assert 0 < np.abs(after - before).max() < 2e-3
 
 
+def test_a_folder_with_any_name_holds_a_model(published: Path, tmp_path: Path) -> None:
+    out = tmp_path / "my model v2"
+    assert ship_model(published, out)["model"] == "my-model-v2"
+    assert read_card(out).name == "my-model-v2"
+
+
 def test_what_cannot_be_shipped(published: Path, shipped: Path) -> None:
     with pytest.raises(UserError, match="already holds a model"):
         ship_model(published, shipped)
@@ -93,7 +99,7 @@ def test_what_cannot_be_shipped(published: Path, shipped: Path) -> None:
 @pytest.fixture(scope="module")
 def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset with nine train rounds that the model was not trained on."""
-    return write_dataset(tmp_path_factory.mktemp("later"), 100, train_rounds=9)
+    return write_dataset(tmp_path_factory.mktemp("later"), 100, train_rounds=9, track="gamma")
 
 
 def test_its_standard_deviations_are_fitted_anew_on_other_rounds(
@@ -108,7 +114,12 @@ def test_its_standard_deviations_are_fitted_anew_on_other_rounds(
     assert (card.uncertainty["data"], card.uncertainty["held_out"]["count"]) == (later.name, 8)
     assert card.uncertainty["seeds"] == {"count": 9, "ranges": "100..108"}
     assert earlier.data["seeds"] == {"count": 3, "ranges": "0..2"}
-    assert card.data == {**earlier.data, "seeds": {"count": 12, "ranges": "0..2 100..108"}}
+    assert "tracks" not in card.uncertainty
+    seen = {
+        "seeds": {"count": 12, "ranges": "0..2 100..108"},
+        "tracks": [*earlier.data["tracks"], "gamma"],
+    }
+    assert card.data == {**earlier.data, **seen}
     frame = Dataset.open(later).select("test").image(0)
     found, before = (load_engine(run, "openvino", "f32")(frame) for run in (out, shipped))
     np.testing.assert_allclose(found[9:], load_engine(out, "torch")(frame)[9:], rtol=5e-3)

@@ -189,3 +189,10 @@ def test_a_signal_after_an_engine_was_dropped_in_another_thread(published: Path)
     command = [sys.executable, "-c", program, str(published)]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (0, "seen\n"), ended.stderr
+
+
+def test_a_processor_without_bf16_states_that_it_computes_in_float32(
+    published: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mtlnet.inference.engine.best_precision", lambda: "f32")
+    assert load_engine(published, precision="bf16").precision == "f32"

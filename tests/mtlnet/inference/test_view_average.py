@@ -127,3 +127,11 @@ def test_torch_computes_the_same_mean(published: Path) -> None:
 def test_another_number_of_views_is_refused() -> None:
     with pytest.raises(UserError, match="--views 3: give 1, 2 or 6"):
         load("default", views=3)
+
+
+def test_a_camera_beside_the_middle_of_the_car_has_one_view() -> None:
+    beside = CameraParameters(y=0.4)
+    Views(1, beside)
+    for count in (2, 6):
+        with pytest.raises(UserError, match=rf"--views {count}: the model's camera is 0\.4 m besi"):
+            Views(count, beside)

@@ -73,3 +73,9 @@ def test_yuv_of_a_grey_and_a_red_picture(encoding: str, order: str) -> None:
 def test_what_is_no_picture_is_refused(encoding: str, length: int, message: str) -> None:
     with pytest.raises(ImageError, match=message):
         decode_raw(np.zeros(length, np.uint8), encoding, 40, 32, 0, big_endian=False)
+
+
+@pytest.mark.parametrize("encoding", ["uyvy", "yuv422", "yuyv", "yuv422_yuy2"])
+def test_an_odd_width_of_shared_colours_is_refused(encoding: str) -> None:
+    with pytest.raises(ImageError, match=rf"width of 41 px is odd, and two pixels of {encoding}"):
+        decode_raw(np.zeros(41 * 32 * 2, np.uint8), encoding, 41, 32, 0, big_endian=False)

@@ -69,6 +69,13 @@ def test_a_bag_states_matrix_and_distortion(
     )
 
 
+def test_a_region_of_the_full_size_is_no_part(tmp_path: Path) -> None:
+    camera = ros_camera(SIZE, MATRIX, "plumb_bob", DISTORTION)
+    camera["roi"] = replace(camera["roi"], width=SIZE[0], height=SIZE[1])
+    found, _ = open_recording(bag(tmp_path / "bag", camera)).camera(MODEL)
+    assert found == replace(OURS, distortion="opencv", coefficients=DISTORTION)
+
+
 def test_a_rectified_topic_has_the_projection_without_distortion(tmp_path: Path) -> None:
     camera = ros_camera(SIZE, MATRIX, "plumb_bob", DISTORTION, (300.0, 301.0, 280.0, 210.0))
     found, _ = open_recording(bag(tmp_path / "bag", camera, "/cam/image_rect_color")).camera(MODEL)

@@ -102,6 +102,26 @@ def test_a_stream_that_fails_keeps_its_answers(
     assert found == pytest.approx([30 * n / 255 - 0.5 for n in range(5)], abs=5e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("20241128120000", "webcam 20241128120000 is no webcam; give its number"),
+        ("/dev/video-front", "/dev/video-front is no webcam"),
+        ("/dev/video0/x", "/dev/video0/x is no webcam"),
+        ("rtsp://me:word@[::1/x", r"^\[::1/x cannot be opened as a stream"),
+        ("a" * 300, "there is no image file a+|cannot be read .File name too long"),
+    ],
+)
+def test_a_wrong_name_leaves_the_other_inputs(
+    engine: BrightnessEngine, tmp_path: Path, name: str, message: str
+) -> None:
+    picture = tmp_path / "a.jpg"
+    picture.write_bytes(simplejpeg.encode_jpeg(np.zeros((210, 280, 3), np.uint8)))
+    with pytest.raises(InputsLeftOut, match=message) as raised:
+        predict_files(engine, [name, str(picture)])
+    assert [row["image"] for row in raised.value.results] == [str(picture)]
+
+
 @pytest.mark.slow
 def test_a_stream_without_connection_that_stops_is_told(
     engine: BrightnessEngine, monkeypatch: pytest.MonkeyPatch
