@@ -25,6 +25,9 @@ LENGTH_M: Final = (50.0, 100_000.0)
 WIDTH_M: Final = (2.0, 60.0)
 FARTHEST_M: Final = 1e7
 """Largest coordinate of a map; it is the largest northing of UTM."""
+LOCAL_M: Final = 1e4
+"""Points farther from the origin are moved to the origin by a multiple of 1 km. Graphics and contacts
+compute in float32, whose spacing is 0.5 m at the northings of UTM."""
 STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
@@ -44,7 +47,7 @@ ROW: Final = "%.6f,%.6f,%.6f,%.6f,%.9f,%.9f\n"
 
 def read_centre_line(path: Path) -> Track:
     """Read a flat track along the points of a CSV file. The track's width is the median of the
-    widths at the points.
+    widths at the points. A track farther than 10 km (LOCAL_M) from the origin is moved to it.
 
     Raises TrackError for a file that is not of this format, or if its points are no closed road.
     """
@@ -91,7 +94,15 @@ def _read_points(path: Path) -> tuple[FloatArray, float]:
             f"{path}: the last point is {apart[-1]:.1f} m from the first; "
             "a track must be one closed loop"
         )
-    return points, float(np.median(widths))
+    return points - _far_origin(points), float(np.median(widths))
+
+
+def _far_origin(points: FloatArray) -> FloatArray:
+    """Return the middle of the points (N, 2), rounded to 1 km, as (2,) m; 0 if all points are within
+    10 km of the origin."""
+    if np.abs(points).max() <= LOCAL_M:
+        return np.zeros(2)
+    return np.asarray(np.round((points.min(axis=0) + points.max(axis=0)) / 2000.0) * 1000.0)
 
 
 def _read_rows(path: Path) -> FloatArray:

@@ -19,6 +19,9 @@ APPARENT_WIDTH_M = (2.75, 4.4)
 height shows the road scaled by the ratio of the heights."""
 MODEL_HEIGHT_M = CameraParameters().height_above_road_m
 CAMERA_HEIGHT_M = (0.9, 2.2)
+BESIDE_PAINT_M = 0.05
+"""Least width (m) of the asphalt outside the paint of an edge. Paint beyond the asphalt would not be
+visible, and the visible rest of a line would not be where the label says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +83,11 @@ class Carriageway:
         taken = max(right.left_m - left.right_m for left, right in pairwise(markings))
         low, high = camera_heights(width, width - taken, model_height_m)
         shoulders = [
-            round(float(size[f"shoulder_{side}_m"]), 3) if marking.lines else 0.0
-            for side, marking in (("left", markings[0]), ("right", markings[-1]))
+            round(max(float(size[f"shoulder_{side}_m"]), least), 3) if least else 0.0
+            for side, least in (
+                ("left", _asphalt_for(markings[0], 1.0)),
+                ("right", _asphalt_for(markings[-1], -1.0)),
+            )
         ]
         return Carriageway(
             lane_width_m=width,
@@ -97,6 +103,13 @@ class Carriageway:
         field is missing."""
         found: Carriageway = rebuilt(Carriageway, values)
         return found
+
+
+def _asphalt_for(edge: Marking, outwards: float) -> float:
+    """Return the width (m) of the asphalt beyond the nominal position of the marking `edge` that
+    its paint needs; 0 without paint. `outwards` is 1 for the left edge and -1 for the right one."""
+    reach = [outwards * line.offset_m + line.width_m / 2 for line in edge.lines]
+    return max(reach) + BESIDE_PAINT_M if reach else 0.0
 
 
 def camera_heights(

@@ -47,6 +47,8 @@ def test_carriageways_keep_the_ranges() -> None:
         ):
             assert 0.0 <= shoulder <= 3.0
             assert marking.lines or shoulder == 0.0
+            for line in marking.lines:  # the whole width of the paint is on the asphalt
+                assert abs(line.offset_m) + line.width_m / 2 < shoulder
         # What is left of every lane between the lines that bound it.
         for left, right in zip(road.markings, road.markings[1:], strict=False):
             assert road.lane_width_m + left.right_m - right.left_m >= 2.7 - 1e-9
