@@ -26,8 +26,8 @@ WIDTH_M: Final = (2.0, 60.0)
 FARTHEST_M: Final = 1e7
 """Largest coordinate of a map; it is the largest northing of UTM."""
 LOCAL_M: Final = 1e4
-"""Points farther from the origin are moved to the origin by a multiple of 1 km. Graphics and contacts
-compute in float32, whose spacing is 0.5 m at the northings of UTM."""
+"""Points farther from the origin are moved to the origin by a multiple of 1 km. Graphics and
+contacts compute in float32, whose spacing is 0.5 m at the northings of UTM."""
 STEP_LIMITS_M: Final = (0.01, 1000.0)
 
 PIECE_M: Final = 4.0
@@ -98,8 +98,8 @@ def _read_points(path: Path) -> tuple[FloatArray, float]:
 
 
 def _far_origin(points: FloatArray) -> FloatArray:
-    """Return the middle of the points (N, 2), rounded to 1 km, as (2,) m; 0 if all points are within
-    10 km of the origin."""
+    """Return the middle of the points (N, 2), rounded to 1 km, as (2,) m; 0 if all points are
+    within 10 km of the origin."""
     if np.abs(points).max() <= LOCAL_M:
         return np.zeros(2)
     return np.asarray(np.round((points.min(axis=0) + points.max(axis=0)) / 2000.0) * 1000.0)

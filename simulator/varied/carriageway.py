@@ -20,8 +20,8 @@ height shows the road scaled by the ratio of the heights."""
 MODEL_HEIGHT_M = CameraParameters().height_above_road_m
 CAMERA_HEIGHT_M = (0.9, 2.2)
 BESIDE_PAINT_M = 0.05
-"""Least width (m) of the asphalt outside the paint of an edge. Paint beyond the asphalt would not be
-visible, and the visible rest of a line would not be where the label says."""
+"""Least width (m) of the asphalt outside the paint of an edge. Paint beyond the asphalt would not
+be visible, and the visible rest of a line would not be where the label says."""
 
 
 @dataclass(frozen=True, slots=True)

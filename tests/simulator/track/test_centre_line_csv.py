@@ -33,11 +33,11 @@ def test_points_of_a_circle_give_its_radius_and_length(tmp_path: Path, repeat_fi
 
 def test_a_track_in_the_coordinates_of_a_map_is_moved_to_the_origin(tmp_path: Path) -> None:
     """Graphics and contacts compute in float32."""
-    rows = np.array([row.split(",") for row in circle()], float)
+    ring = np.array([row.split(",") for row in circle()], float)
     tracks = []
     for x, y in ((0.0, 0.0), (691_000.0, 5_335_000.0), (9_000.0, -9_000.0)):
         path = tmp_path / "ring.csv"
-        np.savetxt(path, rows + [x, y, 0.0, 0.0], "%.6f", ",")
+        np.savetxt(path, ring + np.array([x, y, 0.0, 0.0]), "%.6f", ",")
         tracks.append(read_track(path))
     here, there, near = tracks
     for found, expected in ((there.x0, here.x0), (there.y0, here.y0)):
