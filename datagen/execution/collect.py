@@ -7,7 +7,7 @@ datagen collect --rounds 60 --out datasets/default
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from datagen.recording.folder import (
     prepare,
     read_states,
     round_path,
+    state_path,
     write_if_changed,
 )
 from datagen.recording.manifest import current_split, rebuild
@@ -95,6 +96,7 @@ def collect(
     folder.mkdir(parents=True, exist_ok=True)
     with folder_lock(folder, shard):
         with setup_lock(folder):
+            unrecorded = _unrecorded(folder, plan)
             initialise_folder(folder, plan)
         _remove_leftovers(folder, rounds)
         counter = CollectProgress(rounds, read_states(folder), progress)
@@ -105,17 +107,20 @@ def collect(
         except BaseException:
             with suppress(OSError, tf.UserError):  # the first error is reported, not a later one
                 _remove_leftovers(folder, rounds)
-                _write_derived_files(folder, plan, shard)
+                _write_derived_files(folder, plan, shard, unrecorded)
             raise
         _remove_leftovers(folder, rounds)
-        content_hash = _write_derived_files(folder, plan, shard)
+        content_hash = _write_derived_files(folder, plan, shard, unrecorded)
     if failures:
         raise DatasetError(_failure_message(failures, len(rounds)))
     return counter.result(folder, time.perf_counter() - started, content_hash)
 
 
-def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str | None:
+def _write_derived_files(
+    folder: Path, plan: Plan, shard: Shard | None, unrecorded: Collection[str]
+) -> str | None:
     """Write manifest, split, statistics and card of the finished rounds; return the dataset's hash.
+    `unrecorded` are the ids of the rounds that had never been recorded before this collection.
 
     If `shard` is given and rounds of the plan are still missing, nothing is written and the result
     is None: the shard that ends last writes the files.
@@ -124,7 +129,8 @@ def _write_derived_files(folder: Path, plan: Plan, shard: Shard | None) -> str |
         finished = read_states(folder).keys() & {entry.id for entry in plan.rounds}
         if not finished or (shard is not None and len(finished) < len(plan.rounds)):
             return None
-        return str(rebuild(folder, current_split(folder, sides_of(plan), finished))["content_hash"])
+        split = current_split(folder, sides_of(plan), finished, unrecorded)
+        return str(rebuild(folder, split)["content_hash"])
 
 
 def _failure_message(failures: Sequence[Failure], planned: int) -> str:
@@ -237,7 +243,14 @@ def initialise_folder(folder: Path, plan: Plan) -> None:
     write_if_changed(folder / PLAN_FILE, json.dumps(plan.as_json(), indent=1) + "\n")
     prepare(folder)
     sides = sides_of(plan)
-    write_split(split_path(folder), current_split(folder, sides, sides))
+    split = current_split(folder, sides, sides, _unrecorded(folder, plan))
+    write_split(split_path(folder), split)
+
+
+def _unrecorded(folder: Path, plan: Plan) -> set[str]:
+    """Return the ids of the planned rounds that have never been recorded. A recorded round whose
+    file is missing has a state, and is not among them."""
+    return {entry.id for entry in plan.rounds if not state_path(folder, entry.id).exists()}
 
 
 def sides_of(plan: Plan) -> dict[str, str]:

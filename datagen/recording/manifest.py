@@ -98,23 +98,25 @@ def current_split(
     has replaced it (for example with `datagen split --by track`), the split in `folder`, also with
     only these rounds.
 
-    `side_of` contains the side of each planned round by id. `added` are the ids of rounds that the
-    split in `folder` does not know yet; they are on their planned side.
+    `side_of` contains the side of each planned round by id. `added` are the ids of rounds that are
+    new in `folder`; those that its split does not name are on their planned side. All other rounds
+    that its split does not name stay on no side.
     """
     planned = _planned_split(folder, side_of, listed)
     try:
         found = read_split(split_path(folder))
     except DatasetError:
         return planned
-    named = {i for side in SIDES for i in getattr(found, side)}.difference(added)
+    named = {i for side in SIDES for i in getattr(found, side)}
+    new = {*added} - named
     moved = any(found.side(i) != planned.side(i) for i in named.intersection(listed))
-    known = read_states(folder).keys() & side_of.keys() - set(added)
+    known = read_states(folder).keys() & side_of.keys() - new
     if not moved and not known - named - {*planned.recovered}:
         return planned
     sides = {
         side: (
-            *(i for i in getattr(found, side) if i in listed and i not in added),
-            *(i for i in getattr(planned, side) if i in added),
+            *(i for i in getattr(found, side) if i in listed),
+            *(i for i in getattr(planned, side) if i in new),
         )
         for side in SIDES
     }

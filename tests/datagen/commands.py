@@ -1,5 +1,6 @@
 """Shared by the tests of collection: runs the command and makes jobs."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,8 +12,10 @@ from datagen.planning.planner import make_plan
 from datagen.planning.tracks import choose_tracks
 from datagen.recorder.job import Job, Outcome, attempt
 from datagen.recording.folder import prepare
+from datagen.recording.integrity.recover import recover
 from tests.typed import typed
 
+ROUNDS = ["--rounds", "3", "--frames", "20", "--tracks", "oval", "--workers", "1"]
 SHORT = ["--rounds", "2", "--frames", "30", "--tracks", "circuit", "--lanes", "1,2"]
 
 
@@ -46,3 +49,16 @@ def make_jobs(folder: Path, rounds: int, frames: int) -> list[Job]:
 
 def attempted(job: Job) -> Outcome:
     return attempt(job, lambda message: None)
+
+
+def with_recovered(whole: Path, folder: Path, kept: float = 0.75) -> tuple[Path, int]:
+    """A copy of the dataset in which round-001 was cut to the share `kept` of its bytes and
+    recovered; and its number of frames."""
+    shutil.copytree(whole, folder)
+    file = folder / "rounds" / "round-001.mcap"
+    damaged = folder.parent / "cut.mcap"
+    damaged.write_bytes(file.read_bytes()[: int(file.stat().st_size * kept)])
+    file.unlink()
+    saved = recover(damaged, file).saved
+    assert 0 < saved < 20
+    return folder, saved

@@ -20,7 +20,7 @@ from datagen.recording.manifest import rebuild
 from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.splits import Split
-from tests.datagen.commands import SHORT, datagen
+from tests.datagen.commands import ROUNDS, SHORT, datagen, datagen_here
 from trackfeatures.camera import CameraParameters
 
 LANES = 2
@@ -117,6 +117,15 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = json.loads(done.stdout)
     assert (result["rounds"], result["frames"], result["resets"]) == (2, 60, 0)
     assert result["frames_per_second"] == pytest.approx(60 / result["seconds"], rel=0.01, abs=0.01)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three rounds of the plan ROUNDS; tests do not change them."""
+    folder = tmp_path_factory.mktemp("whole") / "whole"
+    done = datagen_here("collect", *ROUNDS, "--out", folder)
+    assert done.returncode == 0, done.stderr
     return folder
 
 

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,24 +22,14 @@ from datagen.planning.tracks import choose_tracks
 from datagen.recording import Dataset
 from datagen.recording.errors import DatasetError
 from datagen.recording.folder import prepare, read_states
-from datagen.recording.integrity.recover import recover
 from datagen.recording.integrity.verify import verify
-from datagen.recording.splits import read_split, split_path, write_split
-from tests.datagen.commands import datagen_here, make_small_plan
+from datagen.recording.splits import read_split, split_path
+from tests.datagen.commands import ROUNDS, datagen_here, make_small_plan, with_recovered
 from trackfeatures.camera import CameraParameters
-
-ROUNDS = ["--rounds", "3", "--frames", "20", "--tracks", "oval", "--workers", "1"]
 
 
 def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((folder / "rounds").iterdir())}
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("shards") / "whole"
-    assert datagen_here("collect", *ROUNDS, "--out", folder).returncode == 0
-    return folder
 
 
 def test_a_shard_is_every_nth_round() -> None:
@@ -223,23 +212,10 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
         assert time.monotonic() < deadline
 
 
-def _with_recovered(whole: Path, folder: Path, kept: float = 0.75) -> tuple[Path, int]:
-    """A copy of the dataset in which round-001 was cut to the share `kept` of its bytes and
-    recovered; and its number of frames."""
-    shutil.copytree(whole, folder)
-    file = folder / "rounds" / "round-001.mcap"
-    damaged = folder.parent / "cut.mcap"
-    damaged.write_bytes(file.read_bytes()[: int(file.stat().st_size * kept)])
-    file.unlink()
-    saved = recover(damaged, file).saved
-    assert 0 < saved < 20
-    return folder, saved
-
-
 def test_a_recovered_round_stays_in_a_dataset_that_is_collected_again(
     whole: Path, tmp_path: Path
 ) -> None:
-    folder, saved = _with_recovered(whole, tmp_path / "data")
+    folder, saved = with_recovered(whole, tmp_path / "data")
     (folder / "rounds" / "round-002.mcap").unlink()
     done = datagen_here("collect", *ROUNDS, "--out", folder, "--json")
     assert done.returncode == 0, done.stderr
@@ -257,58 +233,8 @@ def test_a_recovered_round_stays_in_a_dataset_that_is_collected_again(
     assert Dataset.open(folder).rounds  # readers can also open it while rounds are recorded
 
 
-@pytest.mark.parametrize("left_out", [True, False])
-def test_a_split_of_the_users_own_stays_when_collected_again(
-    whole: Path, tmp_path: Path, *, left_out: bool
-) -> None:
-    folder = tmp_path / "data"
-    shutil.copytree(whole, folder)
-    planned = read_split(split_path(folder))
-    swapped = replace(planned, train=planned.test, test=planned.train)
-    own = replace(planned, train=planned.train[1:]) if left_out else swapped
-    write_split(split_path(folder), own)
-    (folder / "rounds" / "round-002.mcap").unlink()  # recorded again
-    done = datagen_here("collect", *ROUNDS, "--out", folder, "--json")
-    assert done.returncode == 0, done.stderr
-    assert read_split(split_path(folder)) == own
-    assert Dataset.open(folder).content_hash == json.loads(done.stdout)["content_hash"]
-
-
-@pytest.mark.parametrize("killed", ["no", "yes", "earlier version"])
-def test_a_split_of_the_users_own_stays_when_more_rounds_are_merged(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: str
-) -> None:
-    part, out = tmp_path / "part", tmp_path / "out"
-    shutil.copytree(whole, part)
-    for name in ("rounds/round-002.mcap", "state/round-002.json"):
-        (part / name).unlink()
-    merge([part], out)
-    planned = read_split(split_path(whole))
-    before = read_split(split_path(out))
-    write_split(split_path(out), replace(before, train=before.test, test=before.train))
-    if killed != "no":
-        with monkeypatch.context() as patch:
-            patch.setattr("datagen.execution.merge._derive", _killed)
-            with pytest.raises(KeyboardInterrupt):
-                merge([whole], out)
-        assert (out / "rounds/round-002.mcap").exists()
-    if killed == "earlier version":
-        (out / ".merging").write_text("")
-    assert merge([whole], out).rounds == 3
-    split = read_split(split_path(out))
-    assert split.side("round-002") == planned.side("round-002") != ""
-    swapped = {"train": "test", "test": "train"} if killed != "earlier version" else {}
-    for name in ("round-000", "round-001"):
-        assert split.side(name) == swapped.get(planned.side(name), planned.side(name))
-    assert verify(out, "full").ok
-
-
-def _killed(*_: object) -> None:
-    raise KeyboardInterrupt
-
-
 def test_a_recovered_round_is_merged(whole: Path, tmp_path: Path) -> None:
-    folder, saved = _with_recovered(whole, tmp_path / "data")
+    folder, saved = with_recovered(whole, tmp_path / "data")
     merged = merge([folder], tmp_path / "out")
     assert (merged.rounds, merged.frames) == (3, 40 + saved)
     assert read_split(split_path(tmp_path / "out")).recovered == ("round-001",)
@@ -319,7 +245,7 @@ def test_a_recovered_round_is_merged(whole: Path, tmp_path: Path) -> None:
 def test_merge_prefers_an_undamaged_round_to_a_recovered_one(
     whole: Path, tmp_path: Path, steps: list[list[int]]
 ) -> None:
-    recovered, saved = _with_recovered(whole, tmp_path / "data")
+    recovered, saved = with_recovered(whole, tmp_path / "data")
     folders, out = (whole, recovered), tmp_path / "out"
     for number, step in enumerate(steps):
         # The last step replaces the recovered round if an earlier step has copied it.
@@ -332,8 +258,8 @@ def test_merge_prefers_an_undamaged_round_to_a_recovered_one(
 
 
 def test_merge_takes_the_recovered_round_with_the_most_frames(whole: Path, tmp_path: Path) -> None:
-    one, saved = _with_recovered(whole, tmp_path / "one")
-    other, fewer = _with_recovered(whole, tmp_path / "other", kept=0.5)
+    one, saved = with_recovered(whole, tmp_path / "one")
+    other, fewer = with_recovered(whole, tmp_path / "other", kept=0.5)
     assert fewer < saved
     for number, folders in enumerate(([one, other], [other, one])):
         assert merge(folders, tmp_path / f"out{number}").frames == 40 + saved

@@ -1,0 +1,99 @@
+"""A split that the user has changed stays when its dataset is collected or merged again."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from datagen.execution.merge import merge
+from datagen.recording import Dataset
+from datagen.recording.integrity.verify import verify
+from datagen.recording.splits import Split, read_split, split_path, write_split
+from tests.datagen.commands import ROUNDS, datagen_here
+
+
+def _unfinished(whole: Path, folder: Path) -> Path:
+    """A copy of the dataset in which round-002 has never been recorded."""
+    shutil.copytree(whole, folder)
+    for name in ("rounds/round-002.mcap", "state/round-002.json"):
+        (folder / name).unlink()
+    return folder
+
+
+@pytest.mark.parametrize("shard", [[], ["--shard", "1/1"]])
+def test_rounds_recorded_after_a_change_of_the_split_are_on_their_planned_side(
+    whole: Path, tmp_path: Path, shard: list[str]
+) -> None:
+    folder = _unfinished(whole, tmp_path / "data")
+    assert read_split(split_path(whole)) == Split(("round-001", "round-002"), ("round-000",))
+    own = Split(("round-000",), ("round-001",))
+    write_split(split_path(folder), own)
+    done = datagen_here("collect", *ROUNDS, *shard, "--out", folder, "--json")
+    assert (done.returncode, json.loads(done.stdout)["recorded_frames"]) == (0, 20)
+    assert read_split(split_path(folder)) == replace(own, train=("round-000", "round-002"))
+    assert verify(folder, "full").ok
+
+
+@pytest.mark.parametrize("own", ["before", "meanwhile"])
+def test_a_side_that_the_user_gave_to_an_unrecorded_round_stays(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
+) -> None:
+    folder = _unfinished(whole, tmp_path / "data")
+    split = Split(("round-000", "round-001"), ("round-002",))
+    if own == "before":
+        write_split(split_path(folder), split)
+    else:
+        monkeypatch.setattr(
+            "datagen.execution.collect._remove_leftovers",
+            lambda folder, rounds: write_split(split_path(folder), split),
+        )
+    assert datagen_here("collect", *ROUNDS, "--out", folder).returncode == 0
+    assert read_split(split_path(folder)) == split
+
+
+@pytest.mark.parametrize("left_out", [True, False])
+def test_a_split_of_the_users_own_stays_when_collected_again(
+    whole: Path, tmp_path: Path, *, left_out: bool
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(whole, folder)
+    planned = read_split(split_path(folder))
+    swapped = replace(planned, train=planned.test, test=planned.train)
+    own = replace(planned, train=planned.train[1:]) if left_out else swapped
+    write_split(split_path(folder), own)
+    (folder / "rounds" / "round-002.mcap").unlink()  # recorded again
+    done = datagen_here("collect", *ROUNDS, "--out", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    assert read_split(split_path(folder)) == own
+    assert Dataset.open(folder).content_hash == json.loads(done.stdout)["content_hash"]
+
+
+@pytest.mark.parametrize("killed", ["no", "yes", "earlier version"])
+def test_a_split_of_the_users_own_stays_when_more_rounds_are_merged(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: str
+) -> None:
+    part, out = _unfinished(whole, tmp_path / "part"), tmp_path / "out"
+    merge([part], out)
+    planned = read_split(split_path(whole))
+    before = read_split(split_path(out))
+    write_split(split_path(out), replace(before, train=before.test, test=before.train))
+    if killed != "no":
+        with monkeypatch.context() as patch:
+            patch.setattr("datagen.execution.merge._derive", _killed)
+            with pytest.raises(KeyboardInterrupt):
+                merge([whole], out)
+        assert (out / "rounds/round-002.mcap").exists()
+    if killed == "earlier version":
+        (out / ".merging").write_text("")
+    assert merge([whole], out).rounds == 3
+    split = read_split(split_path(out))
+    assert split.side("round-002") == planned.side("round-002") != ""
+    for name in ("round-000", "round-001"):
+        assert {split.side(name), planned.side(name)} == {"train", "test"}
+    assert verify(out, "full").ok
+
+
+def _killed(*_: object) -> None:
+    raise KeyboardInterrupt
