@@ -27,6 +27,7 @@ from datagen.recording.folder import (
     is_unstarted,
     prepare,
     read_states,
+    require_merged,
     round_path,
     state_path,
     write_if_changed,
@@ -155,7 +156,8 @@ def _remove_leftovers(folder: Path, rounds: Sequence[RoundPlan]) -> None:
 
 
 def require_matching_folder(folder: Path, plan: Plan) -> None:
-    """Raise DatasetError unless `folder` is missing, empty, or a dataset of `plan`.
+    """Raise DatasetError unless `folder` is missing, empty, or a dataset of `plan` into which no
+    merge has been interrupted.
 
     Raises DefinitionsMismatch for a dataset recorded with another version of the label definitions.
     """
@@ -171,6 +173,7 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
                 "Nothing was changed; choose another folder with --out"
             )
         return
+    require_merged(folder)
     try:
         found = json.loads(path.read_text())
         found_hash, definitions, options = found["hash"], found["definitions"], found["wanted"]

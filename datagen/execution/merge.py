@@ -73,6 +73,7 @@ def merge(folders: Sequence[Path], out: Path) -> MergeResult:
         write_if_changed(out / PLAN_FILE, json.dumps(plan, indent=1) + "\n")
         prepare(out)
         planned = {entry["id"]: entry["split"] for entry in plan["rounds"]}
+        current_split(out, planned, ())  # an unreadable split is refused before any change
         best = _best_rounds([out, *folders])
         added = sorted(i for i, (folder, _) in best.items() if folder != out and i in planned)
         try:
@@ -119,8 +120,15 @@ def _copy_rounds(
     """Copy the rounds with the ids `round_ids` into `out`. `found` contains the folder and the
     state of each round by id. Readers refuse the dataset until its split lists the copied
     rounds."""
+    states = read_states(out)
     if round_ids:
-        begin_merge(out, set(round_ids) - read_states(out).keys())
+        # A split may leave a round out because it was recovered. An undamaged copy is a new round.
+        new = (
+            i
+            for i in round_ids
+            if i not in states or (_is_undamaged(*found[i]) and not _is_undamaged(out, states[i]))
+        )
+        begin_merge(out, list(new))
     for round_id in round_ids:
         _copy_round(*found[round_id], out)
 

@@ -13,7 +13,6 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.card import render_card
 from datagen.recording.dataset import Dataset
-from datagen.recording.errors import DatasetError
 from datagen.recording.folder import (
     PUBLISHED_FILES,
     end_merge,
@@ -100,13 +99,14 @@ def current_split(
 
     `side_of` contains the side of each planned round by id. `added` are the ids of rounds that are
     new in `folder`; those that its split does not name are on their planned side. All other rounds
-    that its split does not name stay on no side.
+    that its split does not name stay on no side. Raises DatasetError if the split in `folder` or a
+    round is damaged.
     """
     planned = _planned_split(folder, side_of, listed)
-    try:
-        found = read_split(split_path(folder))
-    except DatasetError:
+    path = split_path(folder)
+    if not path.is_file():
         return planned
+    found = read_split(path)
     named = {i for side in SIDES for i in getattr(found, side)}
     new = {*added} - named
     moved = any(found.side(i) != planned.side(i) for i in named.intersection(listed))

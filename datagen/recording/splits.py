@@ -70,7 +70,8 @@ def read_split(path: Path) -> Split:
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
-            f"{path} is no split: expected JSON with definitions, {', '.join(SIDES)} ({error!r})"
+            f"{path} is no split: expected JSON with definitions, {', '.join(SIDES)} ({error!r}); "
+            "correct the file, or delete it"
         ) from error
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import pytest
 
 from datagen.execution.merge import merge
 from datagen.recording import Dataset
+from datagen.recording.folder import begin_merge, read_states
 from datagen.recording.integrity.verify import verify
 from datagen.recording.splits import Split, read_split, split_path, write_split
-from tests.datagen.commands import ROUNDS, datagen_here
+from tests.datagen.commands import ROUNDS, datagen_here, with_recovered
 
 
 def _unfinished(whole: Path, folder: Path) -> Path:
@@ -93,6 +95,50 @@ def test_a_split_of_the_users_own_stays_when_more_rounds_are_merged(
     for name in ("round-000", "round-001"):
         assert {split.side(name), planned.side(name)} == {"train", "test"}
     assert verify(out, "full").ok
+
+
+def test_a_half_merged_dataset_is_not_collected(
+    whole: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    folder = _unfinished(whole, tmp_path / "data")
+    begin_merge(folder, ["round-001"])
+    mark = (folder / ".merging").read_bytes()
+    assert "running the same `datagen merge` again" in refused("collect", *ROUNDS, "--out", folder)
+    assert (folder / ".merging").read_bytes() == mark
+    assert list(read_states(folder)) == ["round-000", "round-001"]
+
+
+@pytest.mark.parametrize("command", ["collect", "merge"])
+def test_an_unreadable_split_is_refused_before_any_change(
+    whole: Path, tmp_path: Path, refused: Callable[..., str], command: str
+) -> None:
+    folder = _unfinished(whole, tmp_path / "data")
+    text = split_path(folder).read_text().replace("]", ",]", 1)
+    split_path(folder).write_text(text)
+    words = ROUNDS if command == "collect" else [whole]
+    message = refused(command, *words, "--out", folder)
+    assert "default.json is no split" in message
+    assert "correct the file, or delete it" in message
+    assert split_path(folder).read_text() == text
+    assert list(read_states(folder)) == ["round-000", "round-001"]
+    assert not (folder / ".merging").exists()
+
+
+def test_an_undamaged_copy_of_a_recovered_round_that_was_left_out_is_on_its_planned_side(
+    whole: Path, tmp_path: Path
+) -> None:
+    folder, _ = with_recovered(whole, tmp_path / "data")
+    own = Split(("round-000",), ("round-002",))
+    write_split(split_path(folder), own)
+    less, _ = with_recovered(whole, tmp_path / "less", kept=0.5)
+    assert merge([less], folder).added == 0
+    assert read_split(split_path(folder)) == own
+    assert merge([whole], folder).added == 1
+    assert read_split(split_path(folder)) == replace(own, train=("round-000", "round-001"))
+    more, _ = with_recovered(whole, tmp_path / "more")
+    write_split(split_path(less), own)
+    assert merge([more], less).added == 1  # recovered, too
+    assert read_split(split_path(less)) == own
 
 
 def _killed(*_: object) -> None:
