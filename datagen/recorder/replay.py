@@ -54,9 +54,13 @@ def differences(
     entry: RoundPlan, path: Path, tracks_dir: Path | None, pixels: bool
 ) -> Iterator[str]:
     """Yield a line for each topic in which the recorded round at `path` differs from a new
-    simulation of its plan entry. Images are compared only if `pixels` is true."""
+    simulation of its plan entry. Images are compared only if `pixels` is true. Frames that a
+    recovered round has lost are not compared."""
     index = open_round(path)
-    recorded = {topic: index.messages[topic] for topic in (topics.LABELS, topics.EGO_STATE)}
+    recorded = {
+        topic: {time: n for n, time in enumerate(index.messages[topic].log_time.tolist())}
+        for topic in (topics.LABELS, topics.EGO_STATE, topics.CAMERA)
+    }
     first: dict[str, int] = {}
     number = 0
     with open_simulation(entry, tracks_dir) as (simulation, camera):
@@ -66,20 +70,17 @@ def differences(
                     topics.LABELS: messages.labels(truth.frame),
                     topics.EGO_STATE: messages.ego_state(truth.frame.ego),
                 }
+                if pixels:
+                    simulated[topics.CAMERA] = encode(truth.render(camera), entry.codec)
+                time = topics.log_time_ns(number, entry.frequency_hz)
                 for topic, data in simulated.items():
-                    messages_of_topic = recorded[topic]
-                    if (
-                        number >= len(messages_of_topic.log_time)
-                        or messages_of_topic.payload(number) != data
-                    ):
+                    place = recorded[topic].pop(time, None)
+                    lost = place is None and index.recovery is not None
+                    if not lost and (place is None or _payload(index, topic, place) != data):
                         first.setdefault(topic, number)
-                if pixels and not _same_image(
-                    index, number, encode(truth.render(camera), entry.codec)
-                ):
-                    first.setdefault(topics.CAMERA, number)
                 number += 1
-    for topic, messages_of_topic in recorded.items():
-        if len(messages_of_topic.log_time) > number:
+    for topic in (topics.LABELS, topics.EGO_STATE):
+        if recorded[topic]:  # frames that were not simulated
             first.setdefault(topic, number)
     for topic, at in sorted(first.items()):
         yield (
@@ -88,11 +89,10 @@ def differences(
         )
 
 
-def _same_image(index: RoundIndex, number: int, image: bytes) -> bool:
-    images = index.messages[topics.CAMERA]
-    if number >= len(images.log_time):
-        return False
-    return bytes_field(images.payload(number), IMAGE_DATA) == image
+def _payload(index: RoundIndex, topic: str, place: int) -> memoryview:
+    """Return message number `place` of a topic; of an image, only the encoded image."""
+    payload = index.messages[topic].payload(place)
+    return bytes_field(payload, IMAGE_DATA) if topic == topics.CAMERA else payload
 
 
 def _recorded(folder: Path) -> list[RoundPlan]:

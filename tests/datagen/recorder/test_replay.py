@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import pytest
 from datagen.recorder.record import simulate
 from datagen.recorder.replay import replay
 from datagen.recording.frame import EgoState
+from datagen.recording.integrity.recover import IntactFrames, find_intact_frames
 from datagen.recording.schema import messages
-from tests.datagen.commands import datagen_here
+from tests.datagen.commands import datagen_here, with_recovered
 
 
 def test_a_replay_gives_the_same_labels_states_and_pixels(collected: Path) -> None:
@@ -57,6 +59,24 @@ def test_a_replay_finds_one_changed_bit_of_one_state(
     names, (problem,) = replay(collected, 1)
     assert names == ["round-000"]
     assert "/ego/state differs from frame 20 on" in problem
+
+
+def test_a_replay_compares_the_frames_that_a_recovered_round_still_has(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_the_start(data: bytes, frequency_hz: int) -> IntactFrames:
+        found = find_intact_frames(data, frequency_hz)
+        return replace(found, steps={n: step for n, step in found.steps.items() if n >= 5})
+
+    monkeypatch.setattr("datagen.recording.integrity.recover.find_intact_frames", without_the_start)
+    folder, _ = with_recovered(whole, tmp_path / "data")  # without the end, too
+    for name in ("000", "002"):
+        (folder / f"rounds/round-{name}.mcap").unlink()
+    assert replay(folder, 1, pixels=True) == (["round-001"], [])
+    real = messages.labels
+    monkeypatch.setattr(messages, "labels", lambda frame: real(frame) + b"\0")
+    _, (problem,) = replay(folder, 1)
+    assert "/labels differs from frame 5 on" in problem
 
 
 def test_a_replay_finds_that_a_round_holds_more_frames(
