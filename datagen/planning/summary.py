@@ -10,7 +10,7 @@ from rich.table import Table
 import trackfeatures as tf
 from datagen.planning.class_balance import MIN_SHARE, Forecast, expected_shares
 from datagen.planning.plan import Plan, RoundPlan
-from datagen.recording.names import SIDES
+from datagen.recording.names import PLACED, SIDES
 from datagen.recording.round_metadata import summarize_lights
 from simulator.track.random_roads.road import RANDOM, is_random
 
@@ -51,7 +51,8 @@ def overview(plan: Plan, classes: dict[str, dict[str, float]]) -> RenderableType
 
 
 def listing(plan: Plan) -> RenderableType:
-    """Return a table with a row for each round of the plan."""
+    """Return a table with a row for each round of the plan. Speed and start are "-" for a round
+    without a drive."""
     table = Table(box=None)
     names = ("round", "split", "track", "lanes", "traffic", "trajectory", "light", "km/h", "start")
     for name in names:
@@ -66,7 +67,9 @@ def listing(plan: Plan) -> RenderableType:
             e.trajectory,
             summarize_lights(e.lights),
         )
-        table.add_row(*map(str, cells), f"{e.speed_kmh:.1f}", f"{e.start:.3f}")
+        driven = e.trajectory != PLACED
+        drive = (f"{e.speed_kmh:.1f}", f"{e.start:.3f}") if driven else ("-", "-")
+        table.add_row(*map(str, cells), *drive)
     return table
 
 

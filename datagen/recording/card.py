@@ -10,7 +10,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.dataset import Dataset
 from datagen.recording.images import JPEG_QUALITY
-from datagen.recording.names import DRIVEN, SIDES
+from datagen.recording.names import DRIVEN, PLACED, SIDES
 from datagen.recording.schema.fields import FIELDS, Field
 from datagen.recording.schema.json_schema import SCHEMA_FILE
 from datagen.recording.schema.topics import MESSAGE_TYPES
@@ -32,6 +32,8 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
     `datagen.recording.statistics.describe`."""
     headers = [index.header for index in dataset.indexes]
     jittered = any(header.nominal_camera for header in headers)
+    drives = [header for header in headers if header.trajectory != PLACED]
+    hertz = _join({str(header.frequency_hz) for header in drives})
     rounds, frames = statistics["rounds"], statistics["frames"]
     template = files("datagen.recording").joinpath("card.md").read_text(encoding="utf-8")
     return template.format(
@@ -39,7 +41,10 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         size=next((name for most, name in SIZE_CATEGORIES if frames < most), LARGEST_CATEGORY),
         frames=f"{frames:,}",
         rounds=counted(rounds, "round"),
-        hertz=_join({str(header.frequency_hz) for header in headers}),
+        hertz=f", {hertz} a second" if drives else "",
+        similar=f"Frames of a drive are 1/{hertz} s apart and similar"
+        if drives
+        else "Frames of a round show the same road",
         width=dataset.camera.width,
         height=dataset.camera.height,
         hash=dataset.content_hash,
@@ -52,8 +57,9 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         ),
         fields="\n\n".join(_field_table(message) for message in FIELDS),
         program=_join({header.program or "driverview" for header in headers}),
-        driven=_describe_driven([header.id for header in headers]),
-        stretches=_describe_stretches({header.stretch for header in headers} - {0}),
+        driven=_describe_drives([header.id for header in drives], len(headers)),
+        placed=_describe_placed(len(headers) - len(drives), len(headers)),
+        stretches=_describe_stretches({header.stretch for header in drives} - {0}),
         camera=_describe_camera(dataset.camera),
         jitter=", varied a little from round to round (see the metadata of a round)"
         if jittered
@@ -88,13 +94,31 @@ def _describe_camera(camera: CameraParameters) -> str:
     )
 
 
-def _describe_driven(ids: list[str]) -> str:
+def _describe_drives(ids: list[str], rounds: int) -> str:
+    """Describe the rounds with a drive, which have the ids `ids`. `rounds` counts all rounds."""
+    if not ids:
+        return ""
+    who = "A" if len(ids) == rounds else f"In {len(ids)} of {rounds} rounds a"
+    text = (
+        f"{who} scripted driver drives it; trajectory and speed differ by round; the other cars\n"
+        "follow a car-following model.\n"
+    )
     count = sum(name.startswith(DRIVEN) for name in ids)
+    if count:
+        text += (
+            f"In {count} of {rounds} rounds (`{DRIVEN}...`, by `controllers record`) a\n"
+            "controller steers on a model's answers instead; `plan.json` names both.\n"
+        )
+    return text
+
+
+def _describe_placed(count: int, rounds: int) -> str:
     if not count:
         return ""
     return (
-        f"In {count} of {len(ids)} rounds (`{DRIVEN}...`, by `controllers record`) a\n"
-        "controller steers on a model's answers instead; `plan.json` names both.\n"
+        f"In {count} of {rounds} rounds (trajectory `{PLACED}`) the car stands still at another\n"
+        "random pose in each frame, among other cars at random places. These frames have no order\n"
+        "in time.\n"
     )
 
 

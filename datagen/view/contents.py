@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import trackfeatures as tf
 from datagen.recording.errors import DatasetError
+from datagen.recording.names import PLACED
 from datagen.recording.round_metadata import RoundHeader, summarize_lights
 from datagen.recording.schema.messages import EGO, WORLD
 from datagen.recording.schema.topics import (
@@ -84,10 +85,10 @@ class Contents:
         """Summary of the round in one line."""
         h, frames = self.header, len(self.steps)
         road = f"{counted(h.lanes, 'lane')}, {counted(h.traffic, 'other car')}"
-        return (
-            f"{h.id}: {h.track}, {road}, {summarize_lights(h.lights)}, {h.trajectory}, "
-            f"{h.speed_kmh:g} km/h; {frames} frames, {frames / h.frequency_hz:g} s"
-        )
+        line = f"{h.id}: {h.track}, {road}, {summarize_lights(h.lights)}, {h.trajectory}"
+        if h.trajectory == PLACED:  # no drive: the planned speed and the time have no meaning
+            return f"{line}; {counted(frames, 'frame')}"
+        return f"{line}, {h.speed_kmh:g} km/h; {frames} frames, {frames / h.frequency_hz:g} s"
 
     @cached_property
     def plots(self) -> list[Plot]:

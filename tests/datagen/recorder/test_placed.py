@@ -1,6 +1,7 @@
 """Rounds of `datagen collect --poses placed`: in each frame the car stands at a random pose."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,14 @@ def test_plans_of_drives_do_not_mention_the_option() -> None:
     assert CollectConfig(tracks=tracks, poses=PLACED).as_dict()["poses"] == PLACED
     with pytest.raises(tf.UserError, match="unknown poses 'parked'; choose driven, placed"):
         CollectConfig(tracks=tracks, poses="parked")
+
+
+def test_the_listing_of_the_plan_has_no_speed_and_no_start() -> None:
+    args = ["collect", "--rounds", "2", "--frames", "10", "--tracks", "oval", "--dry-run"]
+    for poses, ending in ((PLACED, r"- +-$"), ("driven", r"\d\.\d +0\.\d{3}$")):
+        text = datagen_here(*args, "--poses", poses).stdout
+        rows = [line.rstrip() for line in text.splitlines() if "round-00" in line]
+        assert [bool(re.search(ending, row)) for row in rows] == [True, True]
 
 
 def test_the_export_to_lerobot_says_that_there_is_no_drive(placed: Path, tmp_path: Path) -> None:

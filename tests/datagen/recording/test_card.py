@@ -10,7 +10,9 @@ import pytest
 
 from datagen.recording.card import SIZE_CATEGORIES, render_card
 from datagen.recording.dataset import Dataset
+from datagen.recording.folder import prepare
 from datagen.recording.manifest import rebuild
+from datagen.recording.names import PLACED
 from datagen.recording.schema.fields import FIELDS
 from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.recording.splits import Split
@@ -90,3 +92,26 @@ def test_camera_jitter_and_lossless_rounds_are_stated(samples: Samples, dataset:
     assert "varied a little from round to round" in text
     assert "PNG, lossless" in text
     assert "2 train, 1 test, 1 of no side." in text
+
+
+@pytest.mark.parametrize("driven", [True, False])
+def test_rounds_without_a_drive_are_described_as_such(
+    samples: Samples, tmp_path: Path, *, driven: bool
+) -> None:
+    folder = tmp_path / "data"
+    prepare(folder)
+    for name, trajectory in (("r000", PLACED), ("r001", "weave" if driven else PLACED)):
+        samples.add_round(folder, samples.header(name, trajectory=trajectory, stretch=1))
+    rebuild(folder, Split(("r000",), ("r001",)))
+    text = " ".join((folder / "README.md").read_text().split())
+    for sentence in (
+        "In 1 of 2 rounds a scripted driver drives it;",
+        "90 frames in 2 rounds, 20 a second, 56 x 42 px.",
+        "while the drive goes on",
+        "Frames of a drive are 1/20 s apart and similar: use",
+    ):
+        assert (sentence in text) == driven
+    assert ("scripted driver" in text) == driven
+    assert f"In {1 if driven else 2} of 2 rounds (trajectory `placed`) the car stands still" in text
+    assert "These frames have no order in time." in text
+    assert ("Frames of a round show the same road: use" in text) == (not driven)

@@ -23,6 +23,7 @@ from datagen.cli import app
 from datagen.recording.dataset import Dataset
 from datagen.recording.integrity.recover import recover
 from datagen.recording.mcap.footer import read_summary
+from datagen.recording.names import PLACED
 from datagen.recording.schema.messages import CAMERA_FRAME, EGO
 from datagen.recording.schema.topics import MESSAGE_TYPES
 from datagen.view import rerun as rerun_log
@@ -69,6 +70,16 @@ def test_the_contents_are_what_was_recorded(recorded: Path, dataset: Path) -> No
     assert contents.scene["left"].shape == (10, 3)
     assert "a-track, 2 lanes, 2 other cars, clear, weave, 60 km/h; 45 frames, 2.25 s" in (
         contents.about
+    )
+
+
+def test_the_title_of_a_round_without_a_drive_has_no_speed(
+    samples: Samples, tmp_path: Path
+) -> None:
+    path = tmp_path / "r001.mcap"
+    samples.write(path, samples.header("r001", trajectory=PLACED), samples.frames(40, seed=1))
+    assert Contents.open(path).about == (
+        "r001: a-track, 2 lanes, 2 other cars, clear, placed; 40 frames"
     )
 
 
