@@ -121,20 +121,19 @@ class ServiceModel:
 
 
 def parse_camera(content: Any) -> CameraParameters:
-    """Read the camera in a service's model card. `content` is a dictionary with the image's width
-    and height in px, the position in m, and the field of view and pitch in deg. Raises UserError if
-    a value is missing or is no number."""
+    """Read the camera in a service's model card. `content` is a dictionary with the fields of
+    `CameraParameters`, of which roll, yaw, lens and `height_std` may be missing.
+
+    Raises UserError for a missing or unknown field and an impossible value.
+    """
     try:
-        return CameraParameters(
-            width=int(content["width"]),
-            height=int(content["height"]),
-            fov_y_deg=float(content["fov_y_deg"]),
-            x=float(content["x"]),
-            y=float(content["y"]),
-            z=float(content["z"]),
-            pitch_deg=float(content["pitch_deg"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
+        sizes = {name: int(content[name]) for name in ("width", "height")}
+        numbers = {name: float(content[name]) for name in ("fov_y_deg", "x", "y", "z", "pitch_deg")}
+        turns = ("roll_deg", "yaw_deg", "height_std")
+        numbers |= {name: float(content[name]) for name in turns if name in content}
+        _require_finite(*numbers.values())
+        return CameraParameters(**{**content, **sizes, **numbers})
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"the service's model card gives no usable camera ({error!r}), found {content}; use a "
             "perception service of this version"

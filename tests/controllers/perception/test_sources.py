@@ -217,8 +217,36 @@ def test_images_are_rendered_with_the_models_camera(client: type[FakeClient]) ->
     assert picture.std() > 10  # not a uniform picture
 
 
+LENS = CameraParameters(
+    width=84,
+    height=63,
+    roll_deg=2.0,
+    yaw_deg=-5.0,
+    matrix=(60.0, 61.0, 40.0, 30.0),
+    distortion="fisheye",
+    coefficients=(0.1, 0.0, -0.01, 0.0),
+    height_std=0.1,
+)
+
+
+def test_the_camera_of_a_service_has_all_fields_of_its_model_card() -> None:
+    assert parse_camera(json.loads(json.dumps(LENS.as_dict()))) == LENS
+
+
 @pytest.mark.parametrize(
-    "camera", [None, {}, {**CAMERA, "x": "far"}, {**CAMERA, "fov_y_deg": 180.0}]
+    "camera",
+    [
+        None,
+        {},
+        {name: value for name, value in CAMERA.items() if name != "pitch_deg"},
+        {**CAMERA, "x": "far"},
+        {**CAMERA, "x": float("nan")},
+        {**CAMERA, "width": float("inf")},
+        {**CAMERA, "fov_y_deg": 180.0},
+        {**CAMERA, "roll_deg": "left"},
+        {**CAMERA, "distortion": "fisheye"},
+        {**CAMERA, "shutter": "rolling"},
+    ],
 )
 def test_a_malformed_camera_is_refused(camera: Any) -> None:
     with pytest.raises(UserError, match="model card gives no usable camera"):
