@@ -48,7 +48,8 @@ class Sensor:
     """Shape of a reading; () means a number."""
 
     dtype: str = "float32"
-    """Data type of the reading in an environment's observation."""
+    """Data type of the reading in an environment's observation. Readings of an integer type are
+    rounded to whole numbers."""
 
     def __post_init__(self) -> None:
         if not self.limits[0] < self.limits[1]:
@@ -84,13 +85,15 @@ class Sensor:
             return value
         if rng is not None:
             value += rng.normal(0.0, self.noise)
+        if np.dtype(self.dtype).kind in "iu":
+            value = float(np.rint(value))
         return min(max(value, self.limits[0]), self.limits[1])
 
     def limit(self, exact: NDArray[Any], rng: np.random.Generator | None = None) -> NDArray[Any]:
         """Return the readings `exact` of any shape, clipped to the limits, with noise if `rng` is
         given. Readings equal to `invalid` are not changed."""
         noisy = exact if rng is None else exact + rng.normal(0.0, self.noise, size=exact.shape)
-        if exact.dtype.kind in "iu":
+        if exact.dtype.kind in "iu" or np.dtype(self.dtype).kind in "iu":
             noisy = np.rint(noisy)
         low, high = self.limits
         within = np.minimum(np.maximum(noisy, low), high).astype(exact.dtype, copy=False)

@@ -2,6 +2,7 @@
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -179,6 +180,21 @@ def test_a_user_adds_a_sensor_in_one_line() -> None:
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0, speed=10.0)
         assert suite.read(world)["side_slip"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_noisy_readings_of_an_integer_type_are_rounded() -> None:
+    """Truncated readings would have a mean 0.5 below the exact reading."""
+    sensors = [
+        Sensor("gear", "-", lambda _: 3, noise=2.0, dtype="int32"),
+        Sensor("gears", "-", lambda _: np.full(4, 3.0), noise=2.0, shape=(4,), dtype="int32"),
+        Sensor("share", "-", lambda _: 2.7, dtype="int16"),
+    ]
+    env = gym.make("driverview/LateralControl-v0", track="oval", sensors=sensors)
+    seen = [env.reset(seed=seed)[0] for seed in range(1000)]
+    assert np.mean([one["gear"] for one in seen]) == pytest.approx(3.0, abs=0.25)
+    assert np.mean([one["gears"] for one in seen]) == pytest.approx(3.0, abs=0.12)
+    assert seen[0]["share"].tolist() == [3]
+    env.close()
 
 
 def test_noise_is_off_by_default_seeded_and_of_the_size_asked_for() -> None:
