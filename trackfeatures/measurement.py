@@ -43,9 +43,11 @@ class CentreLine(Protocol):
 
 
 def check_lanes(lanes: int, lane_width_m: float) -> None:
-    """Raises UserError unless `lanes` is 1, 2 or 3 and `lane_width_m` is 2.7 to 4.5 m."""
-    if lanes not in LANES:
-        raise UserError(f"a road of {lanes} lanes is not supported; give 1, 2 or 3")
+    """Raises UserError unless `lanes` is 1, 2 or 3, as an integer and not as a bool, and
+    `lane_width_m` is 2.7 to 4.5 m."""
+    whole = isinstance(lanes, int | np.integer) and not isinstance(lanes, bool)
+    if not whole or lanes not in LANES:
+        raise UserError(f"a road of {lanes!r} lanes is not supported; give 1, 2 or 3")
     lo, hi = LANE_WIDTH_LIMITS_M
     if not lo <= lane_width_m <= hi:
         raise UserError(f"lane width {lane_width_m} m is out of range; give {lo} to {hi} m")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,8 +107,11 @@ def test_mirroring_the_road_swaps_sides(lanes: int, width: float, to_middle: flo
             assert a == pytest.approx(-b, abs=1e-9)
 
 
-@pytest.mark.parametrize(("lanes", "width"), [(0, 4.0), (4, 4.0), (2, 2.6), (2, 4.6)])
-def test_impossible_roads_are_refused(lanes: int, width: float) -> None:
+@pytest.mark.parametrize(
+    ("lanes", "width"),
+    [(0, 4.0), (4, 4.0), (2.0, 4.0), (True, 4.0), ("2", 4.0), (2, 2.6), (2, 4.6)],
+)
+def test_impossible_roads_are_refused(lanes: Any, width: float) -> None:
     with pytest.raises(tf.UserError, match=r"lane"):
         tf.check_lanes(lanes, width)
 
