@@ -1,6 +1,6 @@
 """Reads the project's own track format, a TOML list of straights and bends.
 
-    name, look, surface, width (m), vertical_curve (m)
+    name, look, surface, width (m), vertical_curve (m, at most the lap)
     [markings]   the fields of `MarkingStyle`
     [[segment]]  type = "straight", length (m)
     [[segment]]  type = "bend", radius (m), angle (deg, left positive, spirals included),
@@ -26,7 +26,7 @@ import numpy as np
 
 from simulator.track.errors import TrackError
 from simulator.track.geometry import Surface, Track, readable_name
-from simulator.track.layout import Bend, Segment, Straight, close, lay
+from simulator.track.layout import Bend, Segment, Straight, close, lay, segment_length
 from simulator.track.markings import LineColour, MarkingStyle
 from simulator.track.pieces import assemble, check_closes
 
@@ -92,7 +92,14 @@ def build_track(table: Table, name: str) -> Track:
     width = table.number("width", 6.0, 40.0)
     vertical_curve = table.number("vertical_curve", 1.0, 200.0, 50.0)
     written = read_segments(table)
-    placed = assemble(lay(_closed(written, table.where), width, vertical_curve))
+    closed = _closed(written, table.where)
+    lap = sum(map(segment_length, closed))
+    if vertical_curve > lap:
+        raise TrackError(
+            f"{table.where}: vertical_curve {vertical_curve:g} m is longer than the lap of "
+            f"{lap:.1f} m; give less"
+        )
+    placed = assemble(lay(closed, width, vertical_curve))
     check_closes(placed, table.where, MAX_GAP_M)
     hashed = table.choice("hash", ("geometry", "segments"), "geometry")
     markings = Table(table.values.get("markings", {}), f"{table.where}: [markings]")

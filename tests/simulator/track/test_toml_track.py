@@ -166,3 +166,17 @@ def test_error_for_a_track_without_straights_names_its_file(tmp_path: Path) -> N
     path.write_text('look = "town"\nwidth = 8.0\n' + bend * 3)
     with pytest.raises(TrackError, match=r"round\.toml: straights in two directions"):
         read_toml_track(path)
+
+
+def test_a_vertical_curve_longer_than_the_lap_is_refused(tmp_path: Path) -> None:
+    straight = '[[segment]]\ntype = "straight"\nlength = 10.0\n'
+    bend = '[[segment]]\ntype = "bend"\nradius = 12.0\nangle = 90.0\n'
+    path = tmp_path / "small.toml"
+    lap = 4 * 10.0 + 2 * math.pi * 12.0
+    for curve in (lap - 0.1, lap + 0.1):
+        head = f'look = "town"\nwidth = 9.0\nvertical_curve = {curve}\n'
+        path.write_text(head + 4 * (straight + bend))
+        if curve < lap:
+            assert read_track(path).length_m == pytest.approx(lap)
+    with pytest.raises(TrackError, match=r"vertical_curve 115\.\d+ m is longer than the lap"):
+        read_track(path)
