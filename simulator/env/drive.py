@@ -57,6 +57,7 @@ class Drive:
         self._draws_car = any(
             isinstance(value, tuple) for value in (options.friction, options.mass)
         )
+        self._narrowest = None if options.track == RANDOM else self._narrowest_road()
         self.world = self._make_world(None)
 
     def reset(self, rng: np.random.Generator, given: Mapping[str, Any]) -> int:
@@ -73,16 +74,16 @@ class Drive:
     def check(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return the start of an episode: the start in the car's own options, overridden by the
         options `given` to `reset` that are not None. Ranges stay ranges. Raises UserError for an
-        unknown option, a value that is not a number, or a start off the road. The last check is
-        left out if the episode's road is random."""
+        unknown option, a value that is not a number, or a start off the narrowest road that the
+        options allow. The last check is left out if the track is random."""
         own = {name: value for name, value in given.items() if value is not None}
         start = {**self._options.start, **own}
         ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
         for end in (0, 1):
             values = {name: ranges[name][end] if name in ranges else start[name] for name in start}
-            place = check_start(values, self.world.road)
-            if not self._draws_road:
-                check_place(self.world.road, **place)
+            place = check_start(values, self._narrowest or self.world.road)
+            if self._narrowest is not None:
+                check_place(self._narrowest, **place)
         return start
 
     def _make_world(self, rng: np.random.Generator | None) -> World:
@@ -107,10 +108,21 @@ class Drive:
             track = random_name(0 if rng is None else int(rng.integers(RANDOM_ROADS)))
         if isinstance(lanes, tuple):
             lanes = lanes[0] if rng is None else int(rng.integers(lanes[0], lanes[1] + 1))
-        width = draw(options.lane_width, rng)
-        if isinstance(options.lane_width, tuple):
-            width = round(width, 1)
-        return self._roads.road(options, track, lanes, width)
+        return self._roads.road(options, track, lanes, self._draw_width(rng))
+
+    def _narrowest_road(self) -> Road:
+        options, lanes = self._options, self._options.lanes
+        least, greatest = lanes if isinstance(lanes, tuple) else (lanes, lanes)
+        width = self._draw_width(None)
+        roads = (
+            self._roads.road(options, options.track, count, width)
+            for count in range(least, greatest + 1)
+        )
+        return min(roads, key=lambda road: road.edge)
+
+    def _draw_width(self, rng: np.random.Generator | None) -> float | None:
+        width = self._options.lane_width
+        return round(draw(width, rng), 1) if isinstance(width, tuple) else width
 
 
 def _is_range(setting: Any) -> bool:

@@ -217,6 +217,8 @@ def test_less_grip_lengthens_the_way_to_stop() -> None:
         ({"track": ["oval", "no-such-track", "town"]}, r"^car 1: there is no track"),
         ({"lanes": [1, 2]}, "^lanes is a list of 2 for 3 cars; give one entry for each car"),
         ({"lanes": [1, 2, 4]}, "^car 2: a road of 4 lanes"),
+        ({"lanes": 2.0, "roads": "varied"}, "^a road of 2.0 lanes"),
+        ({"lanes": [1, True, 2]}, "^car 1: a road of True lanes"),
         ({"start": {"s": [1.0, 2.0]}}, "^s is a list of 2 for 3 cars"),
         ({"start": [{}, {"where": 1.0}, {}]}, "^car 1: start has 'where'"),
         ({"friction": [1.0, -0.5, 1.0]}, "^car 1: friction is -0.5; give a factor above 0"),
@@ -309,6 +311,22 @@ def test_bad_resets_name_the_car_and_reset_none() -> None:
         vector.reset(seed=0)
     with pytest.raises(gym.error.ResetNeeded):
         vector.step(np.zeros((3, 1)))
+
+
+@pytest.mark.parametrize("roads", ["paper", "varied"])
+def test_a_start_that_does_not_fit_on_all_random_lanes_is_refused_at_the_first_reset(
+    roads: str,
+) -> None:
+    options = {"lanes": (1, 3), "track": "town", "roads": roads, "start": {"to_middle": 4.9}}
+    vector = make_vector(8, **options)
+    with pytest.raises(UserError, match=r"^car 0: reset got to_middle = 4.9 m; the road ends 4.50"):
+        vector.reset(seed=0)
+    env = gym.make(ID, **options)
+    for seed in range(4):
+        with pytest.raises(UserError, match=r"to_middle = 4.9 m; the road ends 4.50 m"):
+            env.reset(seed=seed)
+    vector.close()
+    env.close()
 
 
 def test_without_autoreset_cars_are_reset_by_mask() -> None:
