@@ -34,6 +34,7 @@ from controllers.rl.config import (
 from controllers.rl.run_folder import RunFolder, prepare_folder
 from runtime.files import locked_folder
 from simulator.env.reward import quadratic_reward
+from simulator.track.random_roads.road import RANDOM
 from simulator.track.road import Road
 from simulator.world.world import World
 from trackfeatures.errors import UserError
@@ -68,6 +69,11 @@ def train(config: TrainConfig, report: Report | None = None) -> dict[str, Any]:
     assert isinstance(settings, Algorithm)
     if config.track == ALL_TRACKS:
         raise UserError("--track all needs several cars; give --envs, for example 256")
+    if config.track == RANDOM:
+        raise UserError(
+            f"--track {RANDOM} gives no fixed road for the evaluations; give one random road, for "
+            "example random:7, or several cars (--envs 256), half of which drive on random roads"
+        )
     options: dict[str, Any] = {"noise": settings.state_noise, "tracks_dir": config.tracks_dir}
     env = gym.make(
         "driverview/LateralControl-v0", track=config.track, disable_env_checker=True, **options

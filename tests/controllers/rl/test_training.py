@@ -262,6 +262,7 @@ def test_the_command_trains_and_drives(tmp_path: Path) -> None:
         (("--algorithm", "ppo", "--state", "residual"), "--state residual needs --envs 1"),
         (("--algorithm", "td3", "--envs", "8", "--state", "stacked"), "--state stacked needs"),
         (("--track", "all"), "--track all needs several cars"),
+        (("--track", "random"), "--track random gives no fixed road"),
         (("--algorithm", "ppo", "--envs", "2", "--track", "nowhere"), "no track 'nowhere'"),
         (("--algorithm", "ppo", "--actor-rate", "nan"), "learning rate nan"),
         (("--algorithm", "ppo", "--state-noise", "-1", "--track", "oval"), "noise is -1"),
