@@ -23,11 +23,8 @@ class OffPolicy:
 
     horizon = 1
 
-    def __init__(
-        self, algorithm: Algorithm, definition: StateDefinition, cars: int, seed: int
-    ) -> None:
+    def __init__(self, algorithm: Algorithm, definition: StateDefinition, seed: int) -> None:
         self._agent = Agent(replace(algorithm, batch=BATCH), definition, seed)
-        self._updates = max(cars // STEPS_PER_UPDATE, 1)
         self.divisor, self.odd = self._agent.divisor, algorithm.mirrored
 
     def act(self, states: Array) -> Array:
@@ -47,11 +44,12 @@ class OffPolicy:
         self, states: Array, actions: Array, step: Step, rng: np.random.Generator, left: float
     ) -> dict[str, float]:
         """Add the transitions of a step to the replay and update the networks; return the means of
-        the critics' loss and of the reward by name, {} before the first update.
+        the critics' loss and of the reward by name, {} in a step without an update.
 
         `left`: share of the training that remains, from 1 down to 0.
         """
         agent, of = self._agent, self._agent.algorithm
+        before = agent.replay.added // STEPS_PER_UPDATE
         rows = zip(
             *(agent.see(states), actions.tolist(), step.rewards.tolist()),
             *(agent.see(step.last), step.ended.tolist()),
@@ -59,10 +57,11 @@ class OffPolicy:
         )
         for row in rows:
             agent.remember(*row)
-        if len(agent.replay) < of.learning_starts:
+        updates = agent.replay.added // STEPS_PER_UPDATE - before
+        if len(agent.replay) < of.learning_starts or not updates:
             return {}
         share = of.rate_end + (1.0 - of.rate_end) * left
-        losses = [agent.update(rng, share) for _ in range(self._updates)]
+        losses = [agent.update(rng, share) for _ in range(updates)]
         return {"loss": float(np.mean(losses)), "reward": float(step.rewards.mean())}
 
     def weights(self) -> dict[str, Array]:

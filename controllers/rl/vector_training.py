@@ -37,7 +37,8 @@ class VectorLearner(Learner, Protocol):
     """A learner that drives N cars at once."""
 
     horizon: int
-    """Steps of each car between two updates. An evaluation always follows an update."""
+    """Number of steps of each car in a batch of an update. The number of steps between two
+    evaluations is a multiple of it."""
     divisor: Array
     odd: bool
 
@@ -85,7 +86,7 @@ def _learner(
 ) -> VectorLearner:
     assert config.envs is not None
     if isinstance(settings, Algorithm):
-        return OffPolicy(settings, definition, config.envs, config.seed)
+        return OffPolicy(settings, definition, config.seed)
     if find_spec("torch") is None:
         raise UserError("ppo needs torch: pip install 'driverview[training]'")
     import torch

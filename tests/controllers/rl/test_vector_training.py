@@ -199,10 +199,25 @@ def test_resume_keeps_the_threads_of_the_start_unless_others_are_given(
     assert [config.threads for config in configs] == [threads]
 
 
+@pytest.mark.parametrize("cars", [2, 8, 12, 15, 24])
+def test_one_update_follows_eight_control_steps_of_all_cars(cars: int) -> None:
+    learner = OffPolicy(replace(ALGORITHMS["td3"], learning_starts=1), PAPER, 0)
+    states, none = np.zeros((cars, PAPER.size), np.float32), np.zeros(cars, np.bool_)
+    nothing, rewards = np.zeros((cars, 0), np.float32), np.zeros(cars)
+    step = Step(states, states, nothing, nothing, rewards, none, none, rewards)
+    rng, updated = np.random.default_rng(0), 0
+    for number in range(1, 9):
+        figures = learner.learn(states, np.zeros(cars, np.float32), step, rng, 1.0)
+        updates = learner.store()[1]["updates"]
+        assert updates == number * cars // 8
+        assert bool(figures) == (updates > updated)
+        updated = updates
+
+
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
 def test_the_evaluated_actor_is_the_saved_one(algorithm: str) -> None:
     settings = replace(ALGORITHMS[algorithm], learning_starts=64)
-    learner, rng = OffPolicy(settings, PAPER, 64, 0), np.random.default_rng(0)
+    learner, rng = OffPolicy(settings, PAPER, 0), np.random.default_rng(0)
     states = rng.normal(0.0, 0.3, (64, PAPER.size)).astype(np.float32)
     none = np.zeros(64, np.bool_)
     for _ in range(5):
