@@ -147,10 +147,10 @@ class World:
             )
         self._contacts.start(self.traffic)
         self._place(start, to_middle, angle, speed)
-        self._controls[:] = 0.0, 0.0, 0.0, 1.0
-        measure_car(self._table, self._row)
-        # After `measure_car`, which counts laps from the earlier place to the start.
         self._row[[STEPS, LAP, LAP_START, TOUCHED, IN_CONTACT]] = 0.0
+        self._controls[:] = 0.0, 0.0, 0.0, 1.0
+        self._row[TRACK_AT + TRACK_S] = start % self.road.track.length_m
+        measure_car(self._table, self._row)
         self._state, self._started = None, True
         return self.state
 

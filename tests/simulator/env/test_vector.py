@@ -191,14 +191,6 @@ def test_ranges_and_random_roads_are_drawn_anew_in_each_episode() -> None:
     vector.close()
 
 
-def test_cars_that_start_on_the_line_have_lap_0_as_in_single_environments() -> None:
-    options = {"track": [f"random:{k}" for k in range(8)], "start": [{"s": 0.0}] * 8}
-    vector = make_vector(8, **options)
-    _, infos = vector.reset(seed=0)
-    singles = [make_single(k, options).reset(seed=k)[1]["lap"] for k in range(8)]
-    assert infos["lap"].tolist() == singles == [0] * 8
-
-
 def test_less_grip_lengthens_the_way_to_stop() -> None:
     options: dict[str, Any] = {"friction": [1.0, 0.5], "controls": "full", "track": "oval"}
     vector = make_vector(2, **options)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import trackfeatures as tf
-from simulator.track.catalogue import OWN_TRACKS, find_track
-from simulator.track.random_roads.road import random_name
+from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import CarState, Command, World
 from tests.simulator.track.track_samples import flat_stadium
@@ -60,18 +59,6 @@ def test_the_same_seed_in_two_processes_is_bit_identical() -> None:
         for _ in range(2)
     ]
     assert there == [here, here]
-
-
-ROADS = [*(path.stem for path in sorted(OWN_TRACKS.glob("*.toml"))), *map(random_name, range(8))]
-
-
-@pytest.mark.parametrize("name", ROADS)
-def test_a_start_on_the_line_has_lap_0_also_on_a_slope(name: str) -> None:
-    """On a slope the centre of gravity lies some millimetres before or behind the start."""
-    with World(Road(find_track(name))) as world:
-        for start, to_middle in ((0.0, 0.0), (-1e-9, 1.5), (-0.001, -1.5), (0.001, 0.0)):
-            state = world.reset(seed=0, s=start, to_middle=to_middle)
-            assert (state.lap, state.lap_time_s) == (0, 0.0)
 
 
 def test_the_start_is_25_m_before_the_line_and_crossing_it_adds_a_lap() -> None:
