@@ -309,7 +309,12 @@ def test_bad_resets_name_the_car_and_reset_none() -> None:
 def test_a_start_that_does_not_fit_on_all_random_lanes_is_refused_at_the_first_reset(
     roads: str,
 ) -> None:
-    options = {"lanes": (1, 3), "track": "town", "roads": roads, "start": {"to_middle": 4.9}}
+    options: dict[str, Any] = {
+        "lanes": (1, 3),
+        "track": "town",
+        "roads": roads,
+        "start": {"to_middle": 4.9},
+    }
     vector = make_vector(8, **options)
     with pytest.raises(UserError, match=r"^car 0: reset got to_middle = 4.9 m; the road ends 4.50"):
         vector.reset(seed=0)
