@@ -1,6 +1,7 @@
 """Opens recorded rounds for training, holds some of them out, and finds undecodable frames."""
 
 import hashlib
+import logging
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.recording import Dataset, DatasetError, Frames, UndecodableImage
+from datagen.recording.splits import split_path
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.inference.model_card import ModelCard, ModelError
 from trackfeatures.camera import CameraParameters
@@ -19,10 +21,13 @@ MIN_ROUNDS_TO_HOLD_OUT = 8
 CHUNK = 64  # images decoded at a time
 MAX_NAMED = 5  # undecodable images named in a message
 
+log = logging.getLogger(__name__)
+
 
 def open_training_dataset(path: Path) -> Dataset:
-    """Open the dataset in folder `path`. Raises UserError when its images do not fit the network,
-    or when it has no train round."""
+    """Open the dataset in folder `path`. Logs a warning about rounds on no side of the split, which
+    are not used. Raises UserError when the images do not fit the network, or when there is no train
+    round."""
     dataset = Dataset.open(path)
     camera = dataset.camera
     if (camera.width, camera.height) != (WIDTH, HEIGHT):
@@ -43,6 +48,15 @@ def open_training_dataset(path: Path) -> Dataset:
             "with a fov_y_deg alone: pictures of any lens are warped into the model's camera"
         )
     dataset.select("train")  # raises where there are none
+    unused = sum(not info.split for info in dataset.rounds)
+    if unused:
+        log.warning(
+            "%d of the %d rounds of %s are not used, because its split (%s) does not name them",
+            unused,
+            len(dataset.rounds),
+            path,
+            split_path(path),
+        )
     return dataset
 
 
