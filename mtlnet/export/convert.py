@@ -96,20 +96,20 @@ def export_model(
     images = shown.read_batch(chosen)
     about: dict[str, Any] = {"format": kind, "precision": precision}
     with replaced_files(folder, last=EXPORT_FILE) as staged:
-        try:
-            if kind == "onnx":
-                names = write_onnx(network, staged, bf16=precision == "bf16")
-            else:
-                int8 = precision == "int8"
-                graph = build_graph(network, served.head, batch=1 if int8 else -1)
-                if int8:
-                    graph, about["float_activations"] = _quantised(graph, card, dataset)
+        if kind == "onnx":
+            names = write_onnx(network, staged, bf16=precision == "bf16")
+        else:
+            int8 = precision == "int8"
+            graph = build_graph(network, served.head, batch=1 if int8 else -1)
+            if int8:
+                graph, about["float_activations"] = _quantised(graph, card, dataset)
+            try:
                 names = write_openvino(graph, staged, precision)
-        except RuntimeError as error:  # OpenVINO's error for a failed write
-            reason = str(error).strip().splitlines()[-1]
-            raise UserError(
-                f"{folder} could not be written ({reason}); is the disk full?"
-            ) from error
+            except RuntimeError as error:  # OpenVINO's error for a failed write
+                reason = str(error).strip().splitlines()[-1]
+                raise UserError(
+                    f"{folder} could not be written ({reason}); is the disk full?"
+                ) from error
         about["check"] = check = check_export(network, staged / names[0], precision, images)
         if precision == "f32" and not check["largest"] <= TOLERANCE:
             raise ModelError(

@@ -330,3 +330,18 @@ def test_a_published_graph_is_on_the_disk_before_it_has_its_name(
     staged, named = ["staged.bin", "staged.xml"], ["model.bin", "model.xml"]
     assert sorted(synced[:2]) == [("staged.bin", staged), ("staged.xml", staged)]
     assert synced[2:] == [(tmp_path.name, named)]
+
+
+def test_only_a_failed_write_is_blamed_on_the_disk(
+    trained: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no room")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("openvino.save_model", fail)
+        with pytest.raises(UserError, match=r"written \(no room\); is the disk full"):
+            export_model(trained, "openvino", "f32", dataset, tmp_path / "a", frames=4)
+    monkeypatch.setattr(mtlnet.export.convert, "build_graph", fail)
+    with pytest.raises(RuntimeError, match=r"^no room$"):
+        export_model(trained, "openvino", "f32", dataset, tmp_path / "b", frames=4)
