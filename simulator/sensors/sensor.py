@@ -49,9 +49,15 @@ class Sensor:
 
     dtype: str = "float32"
     """Data type of the reading in an environment's observation. Readings of an integer type are
-    rounded to whole numbers."""
+    rounded to whole numbers, and `limits` are narrowed to the range of the type."""
 
     def __post_init__(self) -> None:
+        if np.dtype(self.dtype).kind in "iu":
+            range_ = np.iinfo(self.dtype)
+            top = float(range_.max)  # of 64 bits it is rounded up, out of the range
+            top = top if top <= range_.max else math.nextafter(top, 0.0)
+            low, high = max(self.limits[0], float(range_.min)), min(self.limits[1], top)
+            object.__setattr__(self, "limits", (low, high))
         if not self.limits[0] < self.limits[1]:
             raise UserError(
                 f"sensor {self.name!r} has the limits {self.limits}; give the least reading first"

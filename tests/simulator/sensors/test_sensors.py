@@ -197,6 +197,19 @@ def test_noisy_readings_of_an_integer_type_are_rounded() -> None:
     env.close()
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "int8", "int32", "int64", "uint64"])
+def test_readings_of_an_integer_type_without_limits_stay_in_its_range(dtype: str) -> None:
+    sensors = [
+        Sensor("low", "-", lambda _: -1e30, dtype=dtype),
+        Sensor("high", "-", lambda _: np.full(2, 1e30), shape=(2,), dtype=dtype),
+    ]
+    env = gym.make("driverview/LateralControl-v0", track="oval", sensors=sensors)
+    seen = env.reset(seed=1)[0]
+    assert seen["low"].tolist() == [np.iinfo(dtype).min]
+    assert min(seen["high"].tolist()) == pytest.approx(np.iinfo(dtype).max)
+    env.close()
+
+
 def test_noise_is_off_by_default_seeded_and_of_the_size_asked_for() -> None:
     with World(Road(find_track("oval"))) as world:
         world.reset(seed=0, speed=10.0)
