@@ -104,7 +104,9 @@ def recover(
         Path | None,
         typer.Option(
             help="File to write. Default: a new file in the folder of FILE, or in "
-            "DIR/recovered if FILE is in DIR/rounds."
+            "DIR/recovered if FILE is in DIR/rounds. DIR/rounds/ID.mcap makes the file a round of "
+            "the dataset DIR; then run the command that made the dataset again, which lists the "
+            "round as recovered in the split."
         ),
     ] = None,
     as_json: AsJson = False,

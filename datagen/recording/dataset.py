@@ -30,7 +30,6 @@ from datagen.recording.schema.topics import CAMERA, EGO_STATE, LABELS
 from datagen.recording.splits import (
     DEFAULT_SPLIT,
     RoundKey,
-    Split,
     read_split,
     require_disjoint,
     require_recovered_declared,
@@ -210,7 +209,11 @@ class Dataset:
         for index in indexes:
             tf.require_version(index.header.definitions, str(index.path))
         chosen = read_split(split_path(folder, split))
-        _validate_split(chosen, indexes)
+        require_recovered_declared(chosen, indexes, split_path(folder, split))
+        require_disjoint(
+            chosen,
+            [RoundKey(ix.header.id, ix.header.seed, ix.result.content_hash) for ix in indexes],
+        )
         rounds = [
             RoundInfo.of(ix.path, ix.header, ix.result, chosen.side(ix.header.id)) for ix in indexes
         ]
@@ -249,13 +252,6 @@ def round_files(folder: Path) -> list[Path]:
             f"`datagen collect --out {folder}`"
         )
     return files
-
-
-def _validate_split(split: Split, indexes: Sequence[RoundIndex]) -> None:
-    require_recovered_declared(split, indexes)
-    require_disjoint(
-        split, [RoundKey(ix.header.id, ix.header.seed, ix.result.content_hash) for ix in indexes]
-    )
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:

@@ -4,6 +4,10 @@ from pathlib import Path
 
 from trackfeatures.errors import UserError
 
+MAKE_AGAIN = (
+    "run the command that made the dataset (such as `datagen collect`, `datagen merge`) again"
+)
+
 
 class DatasetError(UserError):
     """A dataset folder or one of its rounds cannot be read, or must not be used as it is."""

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import trackfeatures as tf
-from datagen.recording.errors import DatasetError
+from datagen.recording.errors import MAKE_AGAIN, DatasetError
 from datagen.recording.folder import write_if_changed
 from datagen.recording.mcap.index import RoundIndex
 from datagen.recording.names import SIDES
@@ -101,15 +101,16 @@ def require_disjoint(split: Split, rounds: Iterable[RoundKey]) -> None:
             raise _leak("content", min(contents)[:12], one, other)
 
 
-def require_recovered_declared(split: Split, rounds: Iterable[RoundIndex]) -> None:
-    """Raise DatasetError if a recovered round is on a side but not in `split.recovered`."""
+def require_recovered_declared(split: Split, rounds: Iterable[RoundIndex], path: Path) -> None:
+    """Raise DatasetError if a recovered round is on a side but not in `split.recovered`. `path` is
+    the file of the split, for the message."""
     for index in rounds:
         round_id = index.header.id
         if index.recovery and split.side(round_id) and round_id not in split.recovered:
             raise DatasetError(
-                f"round {round_id} was recovered from a damaged file ({index.recovery}) and the "
-                "split does not list it as recovered; record it again, or make a split "
-                "with `datagen split --with-recovered`"
+                f"round {round_id} was recovered from a damaged file ({index.recovery}), and the "
+                f"split does not list it as recovered; {MAKE_AGAIN}, which lists it in the split "
+                f'{DEFAULT_SPLIT!r}, or add "{round_id}" to the list "recovered" in {path}'
             )
 
 

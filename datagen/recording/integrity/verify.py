@@ -156,7 +156,7 @@ def _split_problems(folder: Path, rounds: list[RoundIndex]) -> Iterator[str]:
         try:
             split = read_split(path)
             require_disjoint(split, keys)
-            require_recovered_declared(split, rounds)
+            require_recovered_declared(split, rounds, path)
         except (DatasetError, tf.DefinitionsMismatch) as error:
             yield str(error)
         except OSError as error:

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -187,12 +188,28 @@ def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Pat
     assert not split_path(dataset, "leak").exists()
 
 
-def test_a_new_split_has_recovered_rounds_only_on_request(dataset: Path) -> None:
-    path = round_path(dataset, "r001")
-    damaged = dataset.parent / "r001.mcap"
+def damage_and_recover(path: Path) -> None:
+    damaged = path.parents[2] / path.name
     path.rename(damaged)
     damaged.write_bytes(damaged.read_bytes()[:-20_000])
     recover(damaged, path)
+
+
+def test_the_advice_for_a_recovered_round_can_be_followed(
+    dataset: Path, refused: Callable[..., str]
+) -> None:
+    """Tests of `datagen collect` and `datagen merge` run them on a recovered round."""
+    damage_and_recover(round_path(dataset, "r001"))
+    advice = refused("info", dataset)
+    assert "run the command that made the dataset (such as `datagen collect`" in advice
+    path = split_path(dataset)
+    assert f'or add "r001" to the list "recovered" in {path}' in advice
+    path.write_text(json.dumps({**json.loads(path.read_text()), "recovered": ["r001"]}))
+    assert datagen_here("info", dataset).returncode == 0
+
+
+def test_a_new_split_has_recovered_rounds_only_on_request(dataset: Path) -> None:
+    damage_and_recover(round_path(dataset, "r001"))
     arguments = ("split", str(dataset), "--by", "round", "--test-share", "0.5", "--name")
     assert datagen_here(*arguments, "without").returncode == 0
     assert read_split(split_path(dataset, "without")).side("r001") == ""
