@@ -55,10 +55,10 @@ def differences(
 ) -> Iterator[str]:
     """Yield a line for each topic in which the recorded round at `path` differs from a new
     simulation of its plan entry. Images are compared only if `pixels` is true. Frames that a
-    recovered round has lost are not compared."""
+    recovered round has lost are not compared. Raises DatasetError if the round is damaged."""
     index = open_round(path)
     recorded = {
-        topic: {time: n for n, time in enumerate(index.messages[topic].log_time.tolist())}
+        topic: {time: n for n, time in enumerate(index.log_times(topic).tolist())}
         for topic in (topics.LABELS, topics.EGO_STATE, topics.CAMERA)
     }
     first: dict[str, int] = {}
@@ -90,9 +90,16 @@ def differences(
 
 
 def _payload(index: RoundIndex, topic: str, place: int) -> memoryview:
-    """Return message number `place` of a topic; of an image, only the encoded image."""
-    payload = index.messages[topic].payload(place)
-    return bytes_field(payload, IMAGE_DATA) if topic == topics.CAMERA else payload
+    """Return message number `place` of a topic; of an image, only the encoded image. Raises
+    DatasetError if the message is damaged."""
+    try:
+        payload = index.messages[topic].payload(place)
+        return bytes_field(payload, IMAGE_DATA) if topic == topics.CAMERA else payload
+    except ValueError as error:
+        raise DatasetError(
+            f"{index.path}: message {place} on {topic} cannot be read ({error}); run `datagen "
+            "verify` on the dataset and record the round again"
+        ) from error
 
 
 def _recorded(folder: Path) -> list[RoundPlan]:

@@ -50,11 +50,11 @@ class Steps:
     @staticmethod
     def open(path: Path, topics: tuple[str, ...] = TOPICS) -> "Steps":
         """Open a round for reading `topics`. Raises DatasetError unless every image has a label, a
-        state and a command."""
+        state and a command, or if a message index is damaged."""
         steps = Steps(open_round(path, topics))
-        times = steps.index.messages[CAMERA].log_time
+        times = steps.index.log_times(CAMERA)
         for topic in TOPICS[1:]:
-            if not np.array_equal(steps.index.messages[topic].log_time, times):
+            if not np.array_equal(steps.index.log_times(topic), times):
                 raise DatasetError(
                     f"{path}: its images do not pair with what is on {topic}; run "
                     "`datagen verify` on the dataset and record the round again"

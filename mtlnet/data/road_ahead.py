@@ -121,9 +121,10 @@ class RoadAhead:
 
 def _annotations(path: Path) -> Messages:
     """Read the annotations of a round's frames, in the order of the frames. Raises DatasetError
-    unless each image has its annotation."""
-    found = open_round(path, (CAMERA, ANNOTATIONS)).messages
-    if not np.array_equal(found[CAMERA].log_time, found[ANNOTATIONS].log_time):
+    unless each image has its annotation, or if a message index is damaged."""
+    index = open_round(path, (CAMERA, ANNOTATIONS))
+    found = index.messages
+    if not np.array_equal(index.log_times(CAMERA), index.log_times(ANNOTATIONS)):
         raise DatasetError(
             f"{path.name}: its {len(found[CAMERA])} images do not pair with its "
             f"{len(found[ANNOTATIONS])} annotations; record the round again"

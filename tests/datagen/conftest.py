@@ -17,6 +17,7 @@ from datagen.cli import main as datagen_main
 from datagen.recording.folder import RoundState, partial_path, prepare, publish
 from datagen.recording.frame import DriverCommand, EgoState, Frame, RoadPlace, SensorReadings
 from datagen.recording.manifest import rebuild
+from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.splits import Split
@@ -77,6 +78,14 @@ class Samples:
             self.add_round(folder, self.header(f"r{number:03d}"))
         rebuild(folder, Split(train=("r000", "r001"), test=("r002",)))
         return folder
+
+
+def break_message_index(path: Path, topic: str) -> None:
+    """Flip a bit in the opcode of the first message index of `topic`; no CRC covers it."""
+    data = bytearray(path.read_bytes())
+    summary = read_summary(memoryview(bytes(data)))
+    data[summary.chunks[0].indexes[summary.channels[topic]]] ^= 0x10
+    path.write_bytes(data)
 
 
 @pytest.fixture

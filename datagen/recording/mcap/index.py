@@ -197,6 +197,18 @@ class RoundIndex:
     recovery: Recovery | None = None
     """Recovery record of a round that was recovered from a damaged file and lacks frames."""
 
+    def log_times(self, topic: str) -> NDArray[np.int64]:
+        """Return the log times (N,) in ns of the messages of an opened topic. Raises DatasetError
+        if the message index of the topic is damaged."""
+        try:
+            return self.messages[topic].log_time
+        except ValueError as error:
+            raise DatasetError(
+                f"{self.path}: the message index of {topic} is damaged ({error}); run `datagen "
+                "verify` on the dataset, and record the round again or save its undamaged frames "
+                "with `datagen recover`"
+            ) from error
+
 
 def open_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> RoundIndex:
     """Open a recorded round for reading the topics `topic_names`. Raises DatasetError if the file

@@ -10,11 +10,14 @@ from typing import Any
 import pytest
 
 from datagen.recorder.record import simulate
-from datagen.recorder.replay import replay
+from datagen.recorder.replay import differences, replay
+from datagen.recording.errors import DatasetError
 from datagen.recording.frame import EgoState
 from datagen.recording.integrity.recover import IntactFrames, find_intact_frames
+from datagen.recording.mcap.footer import read_summary
 from datagen.recording.schema import messages
-from tests.datagen.commands import datagen_here, with_recovered
+from tests.datagen.commands import datagen_here, make_small_plan, with_recovered
+from tests.datagen.conftest import Samples, break_message_index
 
 
 def test_a_replay_gives_the_same_labels_states_and_pixels(collected: Path) -> None:
@@ -90,6 +93,24 @@ def test_a_replay_finds_that_a_round_holds_more_frames(
     _, problems = replay(collected, 1)
     (frames,) = {int(problem.split("from frame ")[1].split()[0]) for problem in problems}
     assert (len(problems), frames) == (2, 29)
+
+
+@pytest.mark.parametrize("what", ["index", "message"])
+def test_a_damaged_round_is_refused_by_a_replay(
+    samples: Samples, tmp_path: Path, what: str
+) -> None:
+    """With `--level quick` nothing checks it before."""
+    path = tmp_path / "r000.mcap"
+    samples.write(path, samples.header(), samples.frames(20, seed=1))
+    if what == "index":
+        break_message_index(path, "/labels")
+    else:
+        data = bytearray(path.read_bytes())
+        data[read_summary(memoryview(bytes(data))).chunks[0].start + 500] ^= 1
+        path.write_bytes(data)
+    (entry,) = make_small_plan(1, 20).rounds
+    with pytest.raises(DatasetError, match=rf"r000\.mcap: .*{what}.*`datagen verify`"):
+        list(differences(entry, path, None, pixels=False))
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from datagen.view import rerun as rerun_log
 from datagen.view.contents import Contents
 from datagen.view.html_page import page
 from tests.datagen.commands import datagen_here
-from tests.datagen.conftest import FRAMES, Samples
+from tests.datagen.conftest import FRAMES, Samples, break_message_index
 
 Refused = Callable[..., str]
 
@@ -257,6 +257,20 @@ def test_rounds_that_cannot_be_shown_are_refused_with_a_one_line_error(
         assert f"port {port} cannot be used" in refused("view", recorded, "--web", "--port", port)
     monkeypatch.setattr("datagen.view.show.find_spec", lambda name: None)
     assert "driverview[view]" in refused("view", recorded)
+
+
+def test_a_damaged_message_index_is_refused_with_a_one_line_error(
+    dataset: Path, recorded: Path, tmp_path: Path, refused: Refused
+) -> None:
+    break_message_index(recorded, "/command")
+    assert Dataset.open(dataset).rounds  # it does not read this index
+    for command in (
+        ("view", recorded, "--html", tmp_path / "page.html"),
+        ("export", dataset, "--out", tmp_path / "out"),
+        ("export", dataset, "--out", tmp_path / "out", "--format", "lerobot"),
+        ("stats", dataset),
+    ):
+        assert f"{recorded}: the message index of /command is damaged" in refused(*command)
 
 
 def test_an_incomplete_rerun_file_is_deleted(
