@@ -124,7 +124,8 @@ SplitName = Annotated[
     str,
     typer.Option(
         help="Name of the split, which is the file DIR/splits/NAME.json: letters, digits, '.', "
-        "'_' and '-'."
+        "'_' and '-'. The other commands use the split `default`; to use another split, copy its "
+        "file over DIR/splits/default.json and run the command that made the dataset again."
     ),
 ]
 Near = Annotated[
@@ -174,6 +175,8 @@ def split(
     split in which the same round, seed or content is on two sides is refused. The command counts
     the frames of test and unseen that have a near-duplicate in train: a frame of the same track
     and light at a similar position and angle to the road. An existing split is not overwritten.
+    Rounds that are unseen in the split default, or in the plan if there is no split default, stay
+    unseen.
     """
     from datagen.recording.split_report import SplitConfig, check_split, format_report, make_split
 

@@ -13,6 +13,7 @@ from typing import Any
 import trackfeatures as tf
 from datagen.recording.card import render_card
 from datagen.recording.dataset import Dataset
+from datagen.recording.errors import MAKE_AGAIN
 from datagen.recording.folder import (
     PUBLISHED_FILES,
     end_merge,
@@ -66,7 +67,7 @@ def to_json(content: dict[str, Any]) -> str:
 def manifest_problems(folder: Path) -> Iterator[str]:
     """Yield the problems of `manifest.json`, one line each. Raises the errors of `Dataset.open`."""
     path = folder / MANIFEST
-    remedy = "run the same `datagen collect` again to write it anew"
+    remedy = f"{MAKE_AGAIN} to write it anew"
     if not path.is_file():
         yield f"there is no {path}; {remedy}"
         return
@@ -94,8 +95,8 @@ def current_split(
     added: Collection[str] = (),
 ) -> Split:
     """Return the split of a plan, with only the rounds whose ids are in `listed`; or, if the user
-    has replaced it (for example with `datagen split --by track`), the split in `folder`, also with
-    only these rounds.
+    has replaced it (for example by a split of `datagen split --by track --name NAME`), the split in
+    `folder`, also with only these rounds.
 
     `side_of` contains the side of each planned round by id. `added` are the ids of rounds that are
     new in `folder`; those that its split does not name are on their planned side. All other rounds

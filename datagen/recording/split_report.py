@@ -1,5 +1,6 @@
 """Makes and checks the split of a dataset; counts near-duplicate frames across its sides."""
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from datagen.recording.dataset import Dataset, round_files
 from datagen.recording.errors import DatasetError
 from datagen.recording.mcap.index import open_round
-from datagen.recording.names import SIDES
+from datagen.recording.names import SIDES, UNSEEN
 from datagen.recording.near_duplicates import NearDuplicates, Tolerances, find_near_duplicates
 from datagen.recording.round_metadata import RoundInfo
 from datagen.recording.splits import (
@@ -58,18 +59,18 @@ class SplitReport:
 
 
 def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
-    """Write a new split and return its path. Rounds that are unseen in the default split stay
-    unseen.
+    """Write a new split and return its path. Rounds that are unseen in the default split (if it is
+    missing: in the plan) stay unseen.
 
-    Raises DatasetError if the name exists, there are too few rounds, or the split would leak.
+    Raises DatasetError if the name exists, there are too few rounds, the split would leak, or the
+    default split or the plan cannot be read.
     """
     path = split_path(folder, name)
     if path.exists():
         raise DatasetError(f"{path} exists and stays as it is; choose another --name")
     indexes = [open_round(file) for file in round_files(folder)]
     usable = [ix for ix in indexes if config.with_recovered or ix.recovery is None]
-    default = split_path(folder)
-    unseen = set(read_split(default).unseen) if default.exists() else set()
+    unseen = _unseen(folder)
     infos = [
         RoundInfo.of(ix.path, ix.header, ix.result, "")
         for ix in usable
@@ -86,6 +87,24 @@ def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
     path.parent.mkdir(exist_ok=True)
     write_split(path, split)
     return path
+
+
+def _unseen(folder: Path) -> set[str]:
+    """Return the ids of the rounds that are unseen in the default split or, if it is missing, in
+    the plan. A dataset without both has none."""
+    default, plan = split_path(folder), folder / "plan.json"
+    if default.exists():
+        return set(read_split(default).unseen)
+    if not plan.is_file():
+        return set()
+    try:
+        entries = json.loads(plan.read_text())["rounds"]
+        return {entry["id"] for entry in entries if entry["split"] == UNSEEN}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"{plan} cannot be read ({error!r}), so the unseen rounds are not known; restore the "
+            f"file, or write the split {default}"
+        ) from error
 
 
 def check_split(folder: Path, name: str, tolerances: Tolerances, *, made: bool) -> SplitReport:

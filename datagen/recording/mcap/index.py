@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from datagen.recording.errors import DatasetError
+from datagen.recording.errors import MAKE_AGAIN, DatasetError
 from datagen.recording.mcap.footer import Summary, read_metadata, read_summary
 from datagen.recording.mcap.mmap import map_file
 from datagen.recording.mcap.records import (
@@ -230,8 +230,7 @@ def open_round(path: Path, topic_names: Sequence[str] = LABEL_READER_TOPICS) -> 
             raise
         raise DatasetError(
             f"{path} is damaged or not a recorded round ({error or type(error).__name__}); delete "
-            "it and run the same `datagen collect` again, or save its undamaged frames with "
-            "`datagen recover`"
+            f"it and {MAKE_AGAIN}, or save its undamaged frames with `datagen recover`"
         ) from error
 
 

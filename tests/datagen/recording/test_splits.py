@@ -188,6 +188,25 @@ def test_unseen_rounds_stay_unseen_in_a_new_split(samples: Samples, dataset: Pat
     assert not split_path(dataset, "leak").exists()
 
 
+def test_unseen_rounds_stay_unseen_without_a_default_split(
+    samples: Samples, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    folder = tmp_path / "data"
+    prepare(folder)
+    for n in range(6):
+        samples.add_round(folder, samples.header(f"r{n:03d}"))
+    entries = [{"id": f"r{n:03d}", "split": "unseen" if n > 3 else "train"} for n in range(6)]
+    plan = folder / "plan.json"
+    plan.write_text(json.dumps({"rounds": entries}))
+    make_split(folder, "default", SplitConfig("round", 0.25, 0, with_recovered=False))
+    split = read_split(split_path(folder))
+    assert (split.unseen, len(split.train), len(split.test)) == (("r004", "r005"), 3, 1)
+    split_path(folder).unlink()
+    plan.write_text("{}")
+    assert f"{plan} cannot be read" in refused("split", folder, "--by", "round")
+    assert not split_path(folder).exists()
+
+
 def damage_and_recover(path: Path) -> None:
     damaged = path.parents[2] / path.name
     path.rename(damaged)

@@ -12,6 +12,7 @@ from mcap.writer import Writer
 from datagen.recording import Dataset
 from datagen.recording.folder import round_path, state_path
 from datagen.recording.integrity.verify import verify
+from datagen.recording.manifest import rebuild
 from datagen.recording.mcap.scan import scan
 from datagen.recording.round_metadata import RoundHeader
 from datagen.recording.schema import topics
@@ -56,7 +57,7 @@ def test_a_file_that_is_not_mcap_is_reported(dataset: Path, content: bytes) -> N
         report = verify(dataset, level)
         (problem,) = report.problems
         assert problem.startswith(f"{dataset}/rounds/zz.mcap is damaged or not a recorded round (")
-        assert "delete it and run the same `datagen collect` again" in problem
+        assert "delete it and run the command that made the dataset (such as `datagen" in problem
         assert report.frames == 135
 
 
@@ -257,6 +258,14 @@ def test_a_missing_manifest_and_changed_files_are_found_by_full(dataset: Path) -
     (dataset / "manifest.json").unlink()
     assert "there is no" in verify(dataset, "full").problems[0]
     assert verify(dataset, "quick").ok
+
+
+def test_a_changed_split_is_found_with_the_command_that_mends_it(dataset: Path) -> None:
+    write_split(split_path(dataset), Split(("r001", "r002"), ("r000",)))
+    (problem,) = verify(dataset, "full").problems
+    assert "run the command that made the dataset (such as `datagen collect`" in problem
+    rebuild(dataset, Split(("r001", "r002"), ("r000",)))  # as that command does
+    assert verify(dataset, "full").ok
 
 
 def test_a_gap_in_log_times_is_found(
