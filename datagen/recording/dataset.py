@@ -200,12 +200,12 @@ class Dataset:
     def open(path: str | Path, split: str = DEFAULT_SPLIT) -> "Dataset":
         """Open the dataset in the folder `path` with the split `split`.
 
-        Raises DatasetError if it has no rounds, a round is damaged, a merge has not ended, cameras
-        differ or the split leaks, and DefinitionsMismatch if a round was recorded under other
-        label definitions.
+        Raises DatasetError if it has no rounds, a round is damaged or in two files, a merge has not
+        ended, cameras differ or the split leaks, and DefinitionsMismatch if a round was recorded
+        under other label definitions.
         """
         folder = Path(path)
-        indexes = [open_round(file) for file in round_files(folder)]
+        indexes = open_rounds(folder)
         for index in indexes:
             tf.require_version(index.header.definitions, str(index.path))
         chosen = read_split(split_path(folder, split))
@@ -252,6 +252,21 @@ def round_files(folder: Path) -> list[Path]:
             f"`datagen collect --out {folder}`"
         )
     return files
+
+
+def open_rounds(folder: Path) -> list[RoundIndex]:
+    """Open the finished rounds of a dataset folder, sorted by file name. Raises DatasetError if
+    there are none, a round is damaged, or two files hold the same round."""
+    found: dict[str, RoundIndex] = {}
+    for file in round_files(folder):
+        index = open_round(file)
+        first = found.setdefault(index.header.id, index)
+        if first is not index:
+            raise DatasetError(
+                f"{first.path} and {file} both hold round {index.header.id}; keep one of them, "
+                f"named {index.header.id}.mcap"
+            )
+    return list(found.values())
 
 
 def _one_camera(indexes: Sequence[RoundIndex]) -> CameraParameters:

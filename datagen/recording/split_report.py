@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.recording.dataset import Dataset, round_files
+from datagen.recording.dataset import Dataset, open_rounds
 from datagen.recording.errors import DatasetError
-from datagen.recording.mcap.index import open_round
 from datagen.recording.names import SIDES, UNSEEN
 from datagen.recording.near_duplicates import NearDuplicates, Tolerances, find_near_duplicates
 from datagen.recording.round_metadata import RoundInfo
@@ -68,7 +67,7 @@ def make_split(folder: Path, name: str, config: SplitConfig) -> Path:
     path = split_path(folder, name)
     if path.exists():
         raise DatasetError(f"{path} exists and stays as it is; choose another --name")
-    indexes = [open_round(file) for file in round_files(folder)]
+    indexes = open_rounds(folder)
     usable = [ix for ix in indexes if config.with_recovered or ix.recovery is None]
     unseen = _unseen(folder)
     infos = [

@@ -12,7 +12,7 @@ from pathlib import Path
 import trackfeatures as tf
 from datagen.recording.dataset import dataset_hash, round_files
 from datagen.recording.errors import DatasetError
-from datagen.recording.folder import RoundState, round_path, state_path
+from datagen.recording.folder import RoundState, round_path
 from datagen.recording.integrity.round_checks import LEVELS, check_round, describe_read_error
 from datagen.recording.manifest import manifest_problems
 from datagen.recording.mcap.index import RoundIndex, open_round
@@ -86,7 +86,7 @@ def verify(
 
 
 def _check(folder: Path, file: Path, level: str) -> tuple[int, list[str]]:
-    path = state_path(folder, file.stem)
+    path = folder / "state" / f"{file.stem}.json"
     state, problems = None, []
     try:
         state = RoundState.read(path) if path.is_file() else None
@@ -120,7 +120,7 @@ def _manifest_problems(folder: Path) -> Iterator[str]:
 def _missing_rounds(folder: Path) -> Iterator[str]:
     """Yield a problem for each round with a state but without a file."""
     for path in sorted((folder / "state").glob("*.json")):
-        if not round_path(folder, path.stem).is_file():
+        if not (folder / "rounds" / f"{path.stem}.mcap").is_file():
             yield f"{path.stem}.mcap is missing: state/{path.name} lists it as recorded"
 
 

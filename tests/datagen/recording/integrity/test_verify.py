@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from datagen.recording import Dataset
+from datagen.recording import Dataset, DatasetError
 from datagen.recording.folder import round_path, state_path
 from datagen.recording.integrity.verify import verify
 from datagen.recording.manifest import rebuild
@@ -195,6 +195,22 @@ def test_a_copied_round_is_reported(dataset: Path) -> None:
     assert "r009.mcap: no state file holds its hashes" in problems
     assert "r009.mcap holds round r001" in problems
     assert "r009.mcap has the same images and labels as r001.mcap" in problems
+
+
+@pytest.mark.parametrize("name", ["rounds/r000.mcap", "state/r000.json"])
+def test_a_copy_with_a_space_in_its_name_is_reported(dataset: Path, name: str) -> None:
+    copy = (dataset / name).with_stem("r000 (1)")
+    copy.write_bytes((dataset / name).read_bytes())
+    round_path(dataset, "r001").write_bytes(b"bad")
+    problems = " / ".join(verify(dataset, "quick").problems)
+    assert "r001.mcap is damaged" in problems
+    if name.startswith("rounds"):
+        round_path(dataset, "r001").unlink()
+        with pytest.raises(DatasetError, match=r"r000\.mcap.* both hold round r000; keep one"):
+            Dataset.open(dataset)
+        assert "r000 (1).mcap holds round r000: files were swapped, copied" in problems
+    else:
+        assert "r000 (1).mcap is missing: state/r000 (1).json lists it" in problems
 
 
 def test_an_mcap_file_that_is_no_round_is_reported_as_such(dataset: Path) -> None:
