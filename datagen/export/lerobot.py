@@ -1,12 +1,14 @@
-"""Writes a dataset as a LeRobotDataset v3.0: one episode per round, images in parquet files.
+"""Writes a dataset as a LeRobotDataset v3.0: an episode is a round; images in parquet files.
 
+The frames of an episode have a constant rate. Each part of a recovered round without missing frames
+is an episode of its own.
 LeRobotDataset("driverview/data", root=OUT) reads it. Image bytes are copied as recorded. Episodes
 are sorted by side (train, test, unseen); `splits` in meta/info.json has the episodes of each side.
 Source of the format: github.com/huggingface/lerobot, datasets/lerobot_dataset.py and utils.py.
 """
 
 import json
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from datagen.export.split_sides import Progress, Side
 from datagen.recording.errors import DatasetError
 from datagen.recording.names import PLACED
 from datagen.recording.round_metadata import RoundInfo
+from datagen.recording.schema.topics import CAMERA, steps_at
 from datagen.view.steps import Step, Steps
 from runtime.files import write_json
 from trackfeatures.camera import CameraParameters
@@ -111,9 +114,16 @@ class _Episodes:
             )
         self.fps = header.frequency_hz
         steps = list(round_steps)
+        places = steps_at(round_steps.index.log_times(CAMERA), self.fps)
+        ends = [*(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(steps)]
+        for start, end in pairwise([0, *ends]):
+            self._add_episode(info, header.codec, steps[start:end])
+
+    def _add_episode(self, info: RoundInfo, codec: str, steps: list[Step]) -> None:
+        """Write an episode: consecutive frames `steps` of the round `info`."""
         task = self._tasks.index(_task(info))
         numbers = columns(steps, self.fps, len(self.rows), self.frames, task)
-        self._files.add(table(steps, numbers, header.codec))
+        self._files.add(table(steps, numbers, codec))
         self._add_row(info, numbers, self._count_pixels(info, steps))
 
     def stats(self) -> dict[str, Stats]:
@@ -190,7 +200,9 @@ def _pandas_column(name: str | None, field: str, numpy_type: str, kind: str) -> 
 def _info(
     writer: _Episodes, parts: list[Side], tasks: list[str], camera: CameraParameters
 ) -> dict[str, Any]:
-    ends = list(accumulate((len(side.rounds) for side in parts), initial=0))
+    ids = [{info.id for info in side.rounds} for side in parts]
+    counts = (sum(row["round"] in of_side for row in writer.rows) for of_side in ids)
+    ends = list(accumulate(counts, initial=0))
     return {
         "codebase_version": VERSION,
         "robot_type": "driverview",
