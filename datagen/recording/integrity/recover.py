@@ -153,7 +153,7 @@ def _require_free(target: Path, round_id: str) -> None:
 def _recovery(file: Path, data: bytes, intact: IntactFrames) -> Recovery:
     """Make the recovery record of the damaged `file` with the bytes `data` and the frames `intact`.
     The original number of frames is read from the result metadata or, if they are damaged, from the
-    state of the round."""
+    state of the round. Frames that `file` lacks because it was recovered itself are lost, too."""
     saved = len(intact.steps)
     recorded = _recorded_frames(data)
     if not recorded and file.parent.name == ROUNDS:
@@ -161,7 +161,23 @@ def _recovery(file: Path, data: bytes, intact: IntactFrames) -> Recovery:
         recorded = RoundState.read(state).frames if state.is_file() else 0
     known = recorded >= saved
     total = recorded if known else max(intact.steps) + 1
-    return Recovery(file.name, saved, total - saved, at_least=not known)
+    lost, earlier = total - saved, _earlier_recovery(data)
+    if earlier is None:
+        return Recovery(file.name, saved, lost, at_least=not known)
+    # `total` is the number of frames after the earlier recovery or, if this number is not known,
+    # follows from the highest frame number, which counts the frames lost in between.
+    lost = lost + earlier.lost if known else max(lost, earlier.lost)
+    return Recovery(file.name, saved, lost, at_least=not known or earlier.at_least)
+
+
+def _earlier_recovery(data: bytes) -> Recovery | None:
+    """Return the record of the recovery that wrote `data`; None if there is none or it is
+    damaged."""
+    found = find_metadata(data, RECOVERY_METADATA)
+    try:
+        return None if found is None else Recovery.from_metadata(found)
+    except (ValueError, TypeError):
+        return None
 
 
 def _recorded_frames(data: bytes) -> int:

@@ -125,6 +125,23 @@ def test_a_flipped_bit_loses_only_the_frames_of_its_chunk(
         out.unlink()
 
 
+def test_frames_that_were_lost_before_an_earlier_recovery_stay_counted(
+    samples: Samples, frames: list[Frame], tmp_path: Path
+) -> None:
+    whole = tmp_path / "whole.mcap"
+    samples.write(whole, samples.header("r007"), 3 * frames)
+    data, lost = whole.read_bytes(), 0
+    for turn, chunk in enumerate((0, -1)):
+        bad = bytearray(data)
+        bad[read_summary(memoryview(data)).chunks[chunk].start + 1000] ^= 1
+        file, out = tmp_path / f"bad{turn}.mcap", tmp_path / f"out{turn}.mcap"
+        file.write_bytes(bad)
+        done = recover(file, out)
+        assert (done.saved + done.lost, done.at_least) == (3 * FRAMES, False)
+        assert done.lost > lost
+        data, lost = out.read_bytes(), done.lost
+
+
 def test_a_recovered_round_is_marked_and_can_be_read(
     samples: Samples, undamaged: bytes, frames: list[Frame], ends: list[int], dataset: Path
 ) -> None:
@@ -191,7 +208,8 @@ def test_a_round_named_from_within_its_folder_is_recovered_as_a_round_of_the_dat
     assert done.out == str(dataset / "recovered" / "r001.mcap")
     assert (done.saved + done.lost, done.at_least) == (samples.frames_a_round, False)
     path.unlink()
-    recover(Path(done.out), Path("r001.mcap"))
+    again = recover(Path(done.out), Path("r001.mcap"))
+    assert (again.saved, again.lost, again.at_least) == (done.saved, done.lost, False)
     assert read_states(dataset)["r001"].frames == done.saved
 
 
