@@ -34,6 +34,8 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
     jittered = any(header.nominal_camera for header in headers)
     drives = [header for header in headers if header.trajectory != PLACED]
     hertz = _join({str(header.frequency_hz) for header in drives})
+    apart = _join({f"1/{header.frequency_hz}" for header in drives})
+    changing = {h.stretch for h in drives if len(h.lights) > 1}  # a light for each scene
     rounds, frames = statistics["rounds"], statistics["frames"]
     template = files("datagen.recording").joinpath("card.md").read_text(encoding="utf-8")
     return template.format(
@@ -42,7 +44,7 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         frames=f"{frames:,}",
         rounds=counted(rounds, "round"),
         hertz=f", {hertz} a second" if drives else "",
-        similar=f"Frames of a drive are 1/{hertz} s apart and similar"
+        similar=f"Frames of a drive are {apart} s apart and similar"
         if drives
         else "Frames of a round show the same road",
         width=dataset.camera.width,
@@ -59,7 +61,7 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
         program=_join({header.program or "driverview" for header in headers}),
         driven=_describe_drives([header.id for header in drives], len(headers)),
         placed=_describe_placed(len(headers) - len(drives), len(headers)),
-        stretches=_describe_stretches({header.stretch for header in drives} - {0}),
+        stretches=_describe_stretches(changing - {0}),
         camera=_describe_camera(dataset.camera),
         jitter=", varied a little from round to round (see the metadata of a round)"
         if jittered
@@ -79,9 +81,9 @@ def render_card(dataset: Dataset, statistics: dict[str, Any]) -> str:
 def _describe_stretches(frames: set[int]) -> str:
     if not frames:
         return ""
-    every = _join({str(count) for count in frames})
+    every = "frame" if frames == {1} else f"{_join({str(count) for count in frames})} frames"
     return (
-        f"Every {every} frames the scenery, the weather and the light change, while the drive goes "
+        f"Every {every} the scenery, the weather and the light change, while the drive goes "
         "on: images\nchange abruptly there, labels and states do not. "
     )
 

@@ -94,6 +94,21 @@ def test_camera_jitter_and_lossless_rounds_are_stated(samples: Samples, dataset:
     assert "2 train, 1 test, 1 of no side." in text
 
 
+def test_only_changes_that_happen_and_true_intervals_are_stated(
+    samples: Samples, tmp_path: Path
+) -> None:
+    """A round with one scene shows it in every stretch."""
+    folder = tmp_path / "data"
+    prepare(folder)
+    samples.add_round(folder, samples.header("r000"))
+    samples.add_round(folder, samples.header("r001", frequency_hz=4, stretch=1))
+    rebuild(folder, Split(("r000",), ("r001",)))
+    text = " ".join((folder / "README.md").read_text().split())
+    assert "light change" not in text
+    assert "90 frames in 2 rounds, 20 or 4 a second" in text
+    assert "Frames of a drive are 1/20 or 1/4 s apart" in text
+
+
 @pytest.mark.parametrize("driven", [True, False])
 def test_rounds_without_a_drive_are_described_as_such(
     samples: Samples, tmp_path: Path, *, driven: bool
@@ -101,13 +116,15 @@ def test_rounds_without_a_drive_are_described_as_such(
     folder = tmp_path / "data"
     prepare(folder)
     for name, trajectory in (("r000", PLACED), ("r001", "weave" if driven else PLACED)):
-        samples.add_round(folder, samples.header(name, trajectory=trajectory, stretch=1))
+        lights = ("clear", "fog")
+        header = samples.header(name, trajectory=trajectory, stretch=1, lights=lights)
+        samples.add_round(folder, header)
     rebuild(folder, Split(("r000",), ("r001",)))
     text = " ".join((folder / "README.md").read_text().split())
     for sentence in (
         "In 1 of 2 rounds a scripted driver drives it;",
         "90 frames in 2 rounds, 20 a second, 56 x 42 px.",
-        "while the drive goes on",
+        "Every frame the scenery, the weather and the light change, while the drive goes on",
         "Frames of a drive are 1/20 s apart and similar: use",
     ):
         assert (sentence in text) == driven
