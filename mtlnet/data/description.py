@@ -32,6 +32,7 @@ def describe_data(
     return {
         "path": str(dataset.path),
         "content_hash": dataset.content_hash,
+        "camera": dataset.camera.as_dict(),
         "frames": len(frames),
         "split": splits,
         "held_out": names_entry(info.id for info in fitted),

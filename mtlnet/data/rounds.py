@@ -92,17 +92,21 @@ def select_rounds(dataset: Dataset, names: list[str]) -> Frames:
 
 def require_camera(card: ModelCard, camera: CameraParameters) -> None:
     """Raise ModelError when `camera`, the camera of the data, differs from the model's camera."""
-    found, expected = asdict(camera), asdict(card.camera)
-    if found != expected:
-        differing = ", ".join(
-            f"{name} {_text(found[name])} instead of {_text(expected[name])}"
-            for name in expected
-            if found[name] != expected[name]
-        )
+    if differing := differing_values(camera, card.camera):
         raise ModelError(
             f"the camera of the data is not that of model {card.name}: {differing}; collect with "
             "the model's camera, or train a model for this one"
         )
+
+
+def differing_values(found: CameraParameters, expected: CameraParameters) -> str:
+    """Return the fields in which two cameras differ, for a message; empty if they are equal."""
+    values, others = asdict(found), asdict(expected)
+    return ", ".join(
+        f"{name} {_text(values[name])} instead of {_text(others[name])}"
+        for name in others
+        if values[name] != others[name]
+    )
 
 
 def _text(value: object) -> str:

@@ -13,6 +13,7 @@ from mtlnet.data.custom_images import CustomImages, has_labels_file, open_custom
 from mtlnet.data.description import describe_data, mean_labels
 from mtlnet.data.labels_file import LABELS
 from mtlnet.data.rounds import (
+    differing_values,
     drop_undecodable,
     hold_out_rounds,
     open_training_dataset,
@@ -100,6 +101,7 @@ def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "")
     about = {
         "path": str(folder),
         "content_hash": images.content_hash,
+        "camera": card.camera.as_dict(),
         "frames": len(images),
         "split": {"train": names_entry([str(folder)]), "test": names_entry([])},
         "held_out": names_entry([]),
@@ -182,13 +184,15 @@ def resume_data(
 
     `earlier`: the description of the run's data so far. `start`: the model whose weights the run
     needs again, because it has no checkpoint. Raises ModelError when `start` is another model than
-    at the first start, or when `data` is another dataset and `config.change_data` is not set.
+    at the first start, when `data` has another camera than the run, or when `data` is another
+    dataset and `config.change_data` is not set.
     """
     if start is not None and earlier.get("init") != _origin(start):
         raise ModelError(
             f"{config.out} has no checkpoint, and the model {config.init} is not the one it was "
             "started from; start a new run"
         )
+    _require_run_camera(config, earlier, data.camera)
     history = list(earlier.get("earlier", ()))
     if config.change_data and data.about["content_hash"] != earlier.get("content_hash"):
         history.append(_summary(earlier))
@@ -200,6 +204,20 @@ def resume_data(
     if "init" in earlier:  # a model of this name can have changed since the run was started
         about["init"] = earlier["init"]
     return replace(data, about=about)
+
+
+def _require_run_camera(
+    config: TrainConfig, earlier: dict[str, Any], camera: CameraParameters
+) -> None:
+    """Raise ModelError when `camera`, the camera of the data, differs from the camera of the
+    resumed run, as stored in the description `earlier`."""
+    if "camera" not in earlier:  # written by an earlier version
+        return
+    if differing := differing_values(camera, CameraParameters(**earlier["camera"])):
+        raise ModelError(
+            f"the camera of {config.data} is not the one {config.out} was trained with: "
+            f"{differing}; collect with the run's camera, or start a new run"
+        )
 
 
 def _origin(card: ModelCard) -> dict[str, Any]:

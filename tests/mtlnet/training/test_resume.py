@@ -27,6 +27,7 @@ from mtlnet.training.recipes import find_recipe
 from mtlnet.training.run import create_run
 from runtime.files import locked_folder
 from tests.mtlnet.conftest import training_config, write_dataset
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("short_fit")
@@ -190,6 +191,19 @@ def test_a_run_from_a_model_continues_on_other_data_and_names_that_model(
     hashes = [data["content_hash"] for data in changed["earlier"]]
     assert hashes == [model.data["content_hash"], first["content_hash"]]
     assert changed["content_hash"] == Dataset.open(other_dataset).content_hash
+
+
+@pytest.mark.usefixtures("small_network")
+def test_a_run_does_not_continue_on_images_of_another_camera(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    camera = CameraParameters(fov_y_deg=50.0)
+    other_dataset = write_dataset(tmp_path / "other", first_seed=100, camera=camera)
+    run = training_config(dataset, tmp_path / "run", iterations=1)
+    train(run, None)
+    given = {"iterations": 2, "data": other_dataset, "change_data": True}
+    with pytest.raises(ModelError, match=r"camera of .* fov_y_deg 50 instead of 67\.5"):
+        train(*resume_config(run.out, given))
+    assert read_card(run.out).iterations == 1
 
 
 @pytest.mark.usefixtures("small_network")
