@@ -37,6 +37,7 @@ from mtlnet.training.sources import (
 )
 from mtlnet.training.trainer import Trainer
 from runtime.files import locked_folder, unfinished_path
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 PRETRAINED_FRAMES = 128
@@ -85,8 +86,9 @@ def _open_data(
     """The data of a run and the model that it starts from; makes the folder of a new run."""
     if resumed is None and rank.is_first:
         require_new(config.out)
-    init = None if config.init is None else open_pretrained(config.init)
-    data = open_training_data(config, init[1] if init else None, checked=checked)
+    kept = None if resumed is None else _kept_camera(config, resumed)
+    init = None if config.init is None or kept is not None else open_pretrained(config.init)
+    data = open_training_data(config, init[1] if init else None, kept, checked=checked)
     if resumed is not None and list_checkpoints(config.out):
         init = None  # the checkpoint has replaced the weights of this model
     if resumed is not None:
@@ -96,6 +98,18 @@ def _open_data(
     if resumed is None and rank.is_first:
         create_run(config, find_recipe(config.recipe), data.about)
     return data, init
+
+
+def _kept_camera(config: TrainConfig, resumed: dict[str, Any]) -> CameraParameters | None:
+    """The camera of a resumed run that no longer needs the model of `config.init`, because a
+    checkpoint has replaced its weights.
+
+    None for a run without that model or without a checkpoint, and for a run of an earlier version,
+    which has not stored its camera.
+    """
+    if config.init is None or "camera" not in resumed or not list_checkpoints(config.out):
+        return None
+    return CameraParameters(**resumed["camera"])
 
 
 def _train(

@@ -49,13 +49,18 @@ class TrainingData:
 
 
 def open_training_data(
-    config: TrainConfig, init: ModelCard | None, *, checked: bool = False
+    config: TrainConfig,
+    init: ModelCard | None,
+    kept: CameraParameters | None = None,
+    *,
+    checked: bool = False,
 ) -> TrainingData:
     """Open the folder `config.data` of recorded rounds or of a user's own pictures.
 
-    `init`: card of the model to start from. All images are decoded once, so that a damaged image
-    ends the run at its start; `checked`: the images have been decoded before. Raises UserError for
-    data or a network that does not fit the model.
+    `init`: card of the model to start from. `kept`: the camera to which a user's own pictures are
+    rectified if `init` is None, because the run has started before. All images are decoded once, so
+    that a damaged image ends the run at its start; `checked`: the images have been decoded before.
+    Raises UserError for data or a network that does not fit the model.
     """
     normalised = find_recipe(config.recipe).batch_norm
     if init is not None and normalised and find_architecture(init.network).backbone:
@@ -76,7 +81,8 @@ def open_training_data(
             "rounds, whose split defines what is held out"
         )
     if has_labels_file(config.data):
-        data = custom_training_data(config.data, init, config.hold_out_drives)
+        camera = kept if init is None else init.camera
+        data = custom_training_data(config.data, camera, config.hold_out_drives)
     else:
         dataset = open_training_dataset(config.data)
         if not (checked or config.skip_undecodable):
@@ -87,21 +93,24 @@ def open_training_data(
     return data
 
 
-def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "") -> TrainingData:
-    """Open a user's own pictures in `folder`, rectified to the camera of the model `card`.
+def custom_training_data(
+    folder: Path, camera: CameraParameters | None, drives: str = ""
+) -> TrainingData:
+    """Open a user's own pictures in `folder`, rectified to `camera`, the camera of the model.
 
-    `drives`: names of drives to leave out, separated by commas. Raises UserError if `card` is None.
+    `drives`: names of drives to leave out, separated by commas. Raises UserError if `camera` is
+    None.
     """
-    if card is None:
+    if camera is None:
         raise UserError(
             f"{folder} holds images of your own, without a description of their camera; give the "
             "model to fine-tune with --init RUN, or --init default"
         )
-    images, held_out = hold_out_drives(open_custom_images(folder, card.camera).for_training, drives)
+    images, held_out = hold_out_drives(open_custom_images(folder, camera).for_training, drives)
     about = {
         "path": str(folder),
         "content_hash": images.content_hash,
-        "camera": card.camera.as_dict(),
+        "camera": camera.as_dict(),
         "frames": len(images),
         "split": {"train": names_entry([str(folder)]), "test": names_entry([])},
         "held_out": names_entry([]),
@@ -111,7 +120,7 @@ def custom_training_data(folder: Path, card: ModelCard | None, drives: str = "")
         "held_out_drives": held_out,
         "pictures": sorted({*images.hashes}),
     }
-    return TrainingData(images, None, card.camera, about)
+    return TrainingData(images, None, camera, about)
 
 
 def hold_out_drives(images: CustomImages, drives: str) -> tuple[CustomImages, list[str]]:

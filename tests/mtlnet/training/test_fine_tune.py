@@ -1,5 +1,6 @@
 """Fine-tuning starts with the model's outputs, keeps its camera, and trains on custom images."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from mtlnet.training.config import TrainConfig
 from mtlnet.training.configure import open_pretrained, resume_config
 from mtlnet.training.device import subnormals_as_zero
 from mtlnet.training.sources import continue_from_model, custom_training_data, open_training_data
+from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("short_fit")
@@ -75,7 +77,7 @@ def test_fine_tuning_on_custom_images_lowers_their_error(
     assert card.data["init"] == {"name": before.name, "model_hash": before.model_hash}
     assert card.data["frames"] == 6
     assert card.data["mean"]["distances_m"][:2] == pytest.approx([-1.25, 2.65])
-    material = custom_training_data(custom_images, before)
+    material = custom_training_data(custom_images, before.camera)
     images = material.frames.read_batch(np.arange(6))
     errors = []
     for run in (published, tmp_path / "run"):
@@ -131,7 +133,7 @@ def test_images_of_another_camera_are_evaluated_and_trained_on(
     with pytest.raises(UserError, match=r"--copies is for pictures with a labels\.csv"):
         evaluate([engine], dataset, "all", copies="mirrored")
     card = read_card(published)
-    frames = custom_training_data(custom_images, card).frames
+    frames = custom_training_data(custom_images, card.camera).frames
     assert frames.labels.distances[0, 0] == pytest.approx(-1.0 * 1.2 / 1.5, abs=1e-3)
 
 
@@ -163,9 +165,9 @@ def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
         "trained on": 2,
     }
     with pytest.raises(UserError, match=r"--hold-out-drives has 'x'; the drives in .* 'drive 0', "):
-        custom_training_data(custom_images, read_card(published), "drive 0,x")
+        custom_training_data(custom_images, read_card(published).camera, "drive 0,x")
     with pytest.raises(UserError, match="names all drives"):
-        custom_training_data(custom_images, read_card(published), "drive 0,drive 1,drive 2")
+        custom_training_data(custom_images, read_card(published).camera, "drive 0,drive 1,drive 2")
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def test_a_drive_is_held_out_by_a_name_with_commas(
     published: Path, custom_images: Path, given: str, held_out: list[str]
 ) -> None:
     write_drives(custom_images, ["Berlin, night", "Berlin", "Rome", "Oslo"])
-    data = custom_training_data(custom_images, read_card(published), given)
+    data = custom_training_data(custom_images, read_card(published).camera, given)
     assert data.about["held_out_drives"] == held_out
     kept = {picture.drive for picture in data.frames.pictures}  # type: ignore[union-attr]
     assert kept == {"Berlin, night", "Berlin", "Rome", "Oslo"} - set(held_out)
@@ -206,6 +208,21 @@ def test_a_run_with_drives_held_out_continues_on_other_data(
     assert [data["path"] for data in card.data["earlier"]][-1] == str(custom_images)
     resumed, _ = resume_config(run, {})
     assert (resumed.data, resumed.hold_out_drives, resumed.skip_undecodable) == (dataset, "", True)
+
+
+def test_a_run_on_custom_images_is_resumed_though_its_model_is_gone(
+    published: Path, custom_images: Path, tmp_path: Path
+) -> None:
+    """The images are rectified to the camera that the run has stored."""
+    camera, model, run = CameraParameters(z=1.3), tmp_path / "model", tmp_path / "run"
+    shutil.copytree(published, model)
+    replace(read_card(model), camera=camera).write(model)
+    options = {"data": custom_images, "init": str(model), "iterations": 1, "batch": 4}
+    start_training({**options, "device": "cpu", "threads": 1}, run, resume=False)
+    shutil.rmtree(model)
+    start_training({"iterations": 2}, run, resume=True)
+    card = read_card(run)
+    assert (card.iterations, card.camera) == (2, camera)
 
 
 def test_wrong_options_are_refused(
@@ -252,7 +269,7 @@ def test_the_card_lists_the_seeds_and_tracks_of_both_trainings(
     then = {"path": "datasets/b", "content_hash": "28e3", "frames": 20}
     data = {**then, "seeds": [3, 1], "tracks": ["coast"], "earlier": [first]}
     seen = replace(card, data=data)
-    about = continue_from_model(custom_training_data(custom_images, card), seen).about
+    about = continue_from_model(custom_training_data(custom_images, card.camera), seen).about
     assert about["tracks"] == ["coast"]
     assert about["seeds"] == {"count": 2, "ranges": "1 3"}
     assert about["earlier"] == [first, then]
@@ -284,7 +301,7 @@ def test_a_single_image_is_enough(
     engine = load_engine(tmp_path / "run")
     found = evaluate([engine], custom_images, "all")
     assert (found["frames"], found["errors"]["ml"]["frames"]) == (count, count)
-    [image] = custom_training_data(custom_images, read_card(published)).frames.read_batch(
+    [image] = custom_training_data(custom_images, read_card(published).camera).frames.read_batch(
         np.array([0]), np.empty((1, 210, 280, 3), np.uint8)
     )
     answer = decode_outputs(engine(image))

@@ -224,6 +224,21 @@ def test_a_run_is_resumed_though_its_model_has_been_replaced(dataset: Path, tmp_
         train(*resume_config(run.out, {"iterations": 3}))
 
 
+@pytest.mark.usefixtures("small_network")
+def test_a_run_is_resumed_though_its_model_is_gone(dataset: Path, tmp_path: Path) -> None:
+    train(training_config(dataset, tmp_path / "model", iterations=1), None)
+    options = {"recipe": "continue", "init": str(tmp_path / "model"), "iterations": 1}
+    run = training_config(dataset, tmp_path / "run", **options)
+    first = train(run, None).data
+    shutil.rmtree(tmp_path / "model")
+    card = train(*resume_config(run.out, {"iterations": 2}))
+    assert (card.iterations, card.data) == (2, first)
+    for checkpoint in list_checkpoints(run.out):
+        checkpoint.unlink()
+    with pytest.raises(ModelError, match=r"there is no run .*model"):
+        train(*resume_config(run.out, {"iterations": 3}))
+
+
 def test_a_run_is_resumed_with_the_model_named_as_at_its_start(
     published: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
