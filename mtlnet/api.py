@@ -252,9 +252,10 @@ class Model:
         """Write the model in another format and compare it with torch, as `mtlnet export` does.
 
         `form`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". `data`: the dataset of
-        the comparison, from which `frames` frames are taken; None: the training data. `out`: the
-        folder to write; None: a folder in `export/` of the model's folder. Returns the result of
-        `mtlnet export --json`. Raises UserError for an unsupported export, ModelError when an f32
+        the comparison, from which `frames` frames are taken; None: the training data (a shipped
+        model has no training data, so `data` is required for it). `out`: the folder to write; None:
+        a folder in `export/` of the model's folder. Returns the result of `mtlnet export --json`.
+        Raises UserError for an unsupported export and for missing data, ModelError when an f32
         export differs from torch by more than the tolerance.
         """
         from mtlnet.export.convert import export_model

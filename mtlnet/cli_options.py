@@ -94,7 +94,7 @@ CheckData = Annotated[
         help="Dataset on whose frames the written model is compared with torch. For int8 it is "
         "also used to choose the scales of the integers (train rounds) and for the accuracy "
         "gate (test rounds).",
-        show_default="the dataset of the training",
+        show_default="the dataset of the training; required for a shipped model",
     ),
 ]
 ExportOut = Annotated[

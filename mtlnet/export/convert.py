@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from datagen.recording import Dataset
+from datagen.recording import Dataset, Frames
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.data.custom_images import has_labels_file
 from mtlnet.data.labels_file import LABELS
@@ -74,21 +74,14 @@ def export_model(
     `--json`.
 
     `kind`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". The comparison uses `frames`
-    frames of the dataset `data`, by default of the training data. For int8 it uses frames of the
-    dataset's test rounds only. `out`: the folder to write. Raises UserError for an unsupported
-    export, ModelError when an f32 export differs by more than the tolerance.
+    frames of the dataset `data`, by default of the training data, which a shipped model lacks. For
+    int8 it uses frames of the dataset's test rounds only. `out`: the folder to write. Raises
+    UserError for an unsupported export and for missing data, ModelError when an f32 export differs
+    by more than the tolerance.
     """
     _require_supported(kind, precision, out, frames)
     card = read_card(run)
-    source = data or Path(card.data.get("path", "datasets/default"))
-    if has_labels_file(source):
-        raise UserError(
-            f"{source} holds images with a {LABELS}; an export is checked on recorded rounds: give "
-            "a dataset of `datagen collect` with --data"
-        )
-    dataset = Dataset.open(source)
-    shown = dataset.select("all" if precision != "int8" else "test")
-    require_fit(card, shown, "all")
+    dataset, shown = _open_data(card, precision, data)
     chosen = np.linspace(0, len(shown) - 1, min(frames, len(shown))).astype(np.int64)
     folder = out or run / "export" / f"{kind}-{precision}"
     served = load_served(run, card)
@@ -121,6 +114,27 @@ def export_model(
         about["gate"] = judge(run, dataset.path)
         write_export(folder, card, names, **about)
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
+
+
+def _open_data(card: ModelCard, precision: str, data: Path | None) -> tuple[Dataset, Frames]:
+    """Open the dataset `data`, by default of the training data; returns it and the frames that the
+    comparison can use. Raises UserError or ModelError for data that cannot be used."""
+    source = data or Path(card.data.get("path", "datasets/default"))
+    if has_labels_file(source):
+        raise UserError(
+            f"{source} holds images with a {LABELS}; an export is checked on recorded rounds: give "
+            "a dataset of `datagen collect` with --data"
+        )
+    if data is None and not (source / "rounds").is_dir():
+        raise UserError(
+            f"the dataset on which model {card.name} was trained ({source}) is not here; give a "
+            "dataset of the same camera, on which the export is compared with torch, with "
+            "--data DIR (in Python data=DIR)"
+        )
+    dataset = Dataset.open(source)
+    shown = dataset.select("all" if precision != "int8" else "test")
+    require_fit(card, shown, "all")
+    return dataset, shown
 
 
 def _quantised(graph: Any, card: ModelCard, dataset: Dataset) -> tuple[Any, tuple[int, ...]]:
