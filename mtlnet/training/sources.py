@@ -106,7 +106,8 @@ def custom_training_data(
             f"{folder} holds images of your own, without a description of their camera; give the "
             "model to fine-tune with --init RUN, or --init default"
         )
-    images, held_out = hold_out_drives(open_custom_images(folder, camera).for_training, drives)
+    opened, held_out = hold_out_drives(open_custom_images(folder, camera), drives)
+    images = opened.for_training
     about = {
         "path": str(folder),
         "content_hash": images.content_hash,
@@ -116,7 +117,7 @@ def custom_training_data(
         "held_out": names_entry([]),
         "seeds": Seeds.of([]).entry(),
         "tracks": [],
-        "mean": mean_labels(images.labels),
+        "mean": mean_labels(opened.labels),  # evaluations are in metres at the pictures' cameras
         "held_out_drives": held_out,
         "pictures": sorted({*images.hashes}),
     }

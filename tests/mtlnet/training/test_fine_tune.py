@@ -188,6 +188,20 @@ def test_a_drive_is_held_out_by_a_name_with_commas(
     assert kept == {"Berlin, night", "Berlin", "Rome", "Oslo"} - set(held_out)
 
 
+def test_held_out_drives_are_not_converted_and_the_mean_label_is_in_metres_of_the_pictures(
+    published: Path, custom_images: Path
+) -> None:
+    """The camera is 1.4 m high, the model's 1.2 m: at the model's camera `ml` of the second drive
+    would be -0.47 m, which the coding cannot express."""
+    (custom_images / "camera.yaml").write_text("height_above_road_m: 1.4\n")
+    rows = ["0.png,-1.75,1.75,,,,0,straight,a", "1.png,-0.55,2.95,?,?,?,0,straight,b"]
+    header = "file,ml,mr,l,m,r,angle,heading,drive"
+    (custom_images / "labels.csv").write_text("\n".join([header, *rows]) + "\n")
+    data = custom_training_data(custom_images, read_card(published).camera, "b")
+    assert data.about["mean"]["distances_m"][:2] == pytest.approx([-1.75, 1.75])
+    assert data.frames.labels.distances[0, :2] == pytest.approx([-1.5, 1.5], abs=1e-3)
+
+
 @pytest.mark.usefixtures("short_fit")
 def test_a_run_with_drives_held_out_continues_on_other_data(
     published: Path, custom_images: Path, dataset: Path, tmp_path: Path
