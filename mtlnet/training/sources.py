@@ -28,6 +28,9 @@ from mtlnet.training.recipes import find_recipe
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
+SAME_DATA = ("content_hash", "split")
+"""Entries of a description of data that are equal if a run has the same data as before."""
+
 
 @dataclass(frozen=True)
 class TrainingData:
@@ -195,7 +198,7 @@ def resume_data(
     `earlier`: the description of the run's data so far. `start`: the model whose weights the run
     needs again, because it has no checkpoint. Raises ModelError when `start` is another model than
     at the first start, when `data` has another camera than the run, or when `data` is another
-    dataset and `config.change_data` is not set.
+    dataset or has another split and `config.change_data` is not set.
     """
     if start is not None and earlier.get("init") != _origin(start):
         raise ModelError(
@@ -204,7 +207,7 @@ def resume_data(
         )
     _require_run_camera(config, earlier, data.camera)
     history = list(earlier.get("earlier", ()))
-    if config.change_data and data.about["content_hash"] != earlier.get("content_hash"):
+    if config.change_data and any(data.about[name] != earlier.get(name) for name in SAME_DATA):
         history.append(_summary(earlier))
     else:
         require_same_data(config, earlier, data.about)
@@ -253,7 +256,7 @@ def _with_seen(about: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]
 def require_same_data(config: TrainConfig, resumed: dict[str, Any], data: dict[str, Any]) -> None:
     """Raise ModelError unless `data`, the description of a resumed run's data, has the same content
     hash and split as `resumed`, the description stored when the run was started."""
-    for name in ("content_hash", "split"):
+    for name in SAME_DATA:
         if resumed.get(name) != data.get(name):
             raise ModelError(
                 f"the {name.replace('_', ' ')} of {config.data} is not the one {config.out} was "
