@@ -97,6 +97,8 @@ def export_command(
     A model in int8 must also pass the accuracy gate: on the test rounds its mean errors may be at
     most 0.003 m (distances), 0.0002 rad (angle) and 0.001 (share of wrong classes) larger than in
     float32. Otherwise `serve` and `mtlnet` do not use it by default.
+
+    An ONNX model has no standard deviations and no out-of-distribution score.
     """
     from rich.console import Console
 

@@ -7,8 +7,8 @@ accuracy gate: its errors on the test rounds are at most a little larger than th
 Each export is compared with torch on frames of a dataset.
 
 ONNX and OpenVINO models take any number of images at once (first axis, "batch") and give the same
-answers as for single images. The int8 graph takes one image, as the engine does, because a graph
-for a single image is faster.
+answers as for single images. ONNX models lack the uncertainty head. The int8 graph takes one image,
+as the engine does, because a graph for a single image is faster.
 """
 
 import logging

@@ -201,6 +201,7 @@ def test_an_onnx_model_reads_bins_as_torch_does(tmp_path: Path) -> None:
     options = {"INFERENCE_PRECISION_HINT": "f32"}  # on some processors the default is bf16
     model = openvino_core().compile_model(str(tmp_path / ONNX_FILE), "CPU", options)
     assert [result.any_name for result in model.outputs] == ["outputs", "absent"]
+    assert [part.shape for part in model(frames).values()] == [(4, OUTPUTS), (4, len(tf.MARKINGS))]
     (batch, *sizes) = model.input("images").partial_shape
     assert (batch.is_dynamic, sizes) == (True, [210, 280, 3])
     absent = [model(frame[None])["absent"][0] for frame in frames]
