@@ -23,7 +23,7 @@ from datagen.recording import Dataset, Frames
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.data.custom_images import has_labels_file
 from mtlnet.data.labels_file import LABELS
-from mtlnet.data.rounds import hold_out_rounds
+from mtlnet.data.rounds import hold_out_rounds, require_decodable
 from mtlnet.evaluation.evaluate import require_fit
 from mtlnet.export.int8 import (
     FLOAT_ACTIVATIONS,
@@ -132,8 +132,12 @@ def _open_data(card: ModelCard, precision: str, data: Path | None) -> tuple[Data
             "--data DIR (in Python data=DIR)"
         )
     dataset = Dataset.open(source)
-    shown = dataset.select("all" if precision != "int8" else "test")
-    require_fit(card, shown, "all")
+    split = "test" if precision == "int8" else "all"
+    shown = dataset.select(split)
+    require_fit(card, shown, split)
+    if precision == "int8":
+        # The gate reads all of them, but only after the new graph has replaced the old one.
+        require_decodable(shown, source)
     return dataset, shown
 
 
