@@ -74,7 +74,10 @@ class AblationConfig:
     threads: Annotated[int, Option(help="Number of CPU threads; 0: one per CPU core.")] = 0
 
     def __post_init__(self) -> None:
-        find_recipe(self.recipe)
+        if find_recipe(self.recipe).from_model:
+            raise UserError(
+                f"recipe {self.recipe} starts from a finished model; give --recipe fast or paper"
+            )
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise UserError(f"--seeds {self.seeds} must be different numbers, at least one")
 

@@ -117,6 +117,23 @@ def plan_runs(config: AblationConfig, rows: Sequence[Row]) -> list[Run]:
     ]
 
 
+def training_config(config: AblationConfig, run: Run) -> TrainConfig:
+    """Return the configuration of a run's training. Raises UserError for options that a training
+    refuses."""
+    return TrainConfig(
+        data=config.data,
+        out=run.folder,
+        network=run.row.network,
+        alpha=run.row.alpha,
+        recipe=config.recipe,
+        iterations=config.iterations,
+        seed=run.seed,
+        batch=config.batch,
+        device=config.device,
+        threads=config.threads,
+    )
+
+
 def require_same_settings(config: AblationConfig, content_hash: str) -> None:
     """Check that the folder `config.out` belongs to an ablation with the same settings. If the
     folder is new or empty, write the settings to it.
@@ -164,18 +181,7 @@ def finish_runs(
 
 def _finish(config: AblationConfig, run: Run, train: Train, evaluate: Evaluate) -> None:
     """Train or resume the run, evaluate it, and delete its checkpoints."""
-    train_config = TrainConfig(
-        data=config.data,
-        out=run.folder,
-        network=run.row.network,
-        alpha=run.row.alpha,
-        recipe=config.recipe,
-        iterations=config.iterations,
-        seed=run.seed,
-        batch=config.batch,
-        device=config.device,
-        threads=config.threads,
-    )
+    train_config = training_config(config, run)
     if not (run.folder / CARD).is_file():
         if (run.folder / CONFIG).is_file():
             given = {k: v for k, v in vars(train_config).items() if k not in ("out", "minutes")}

@@ -31,6 +31,7 @@ from mtlnet.ablation.plan import (
     plan_runs,
     require_same_settings,
     table,
+    training_config,
     training_curve,
 )
 from mtlnet.architecture import find_architecture
@@ -57,12 +58,15 @@ REPORT_SECONDS = 30.0
 def ablate(config: AblationConfig, rows: Sequence[Row], *, dry_run: bool = False) -> dict[str, Any]:
     """Run an ablation, or only plan it with `dry_run`; returns the result that `--json` prints.
 
-    Raises UserError when the folder contains an ablation with other settings, or when a run fails.
+    Raises UserError for options that a training refuses, when the folder contains an ablation with
+    other settings, or when a run fails.
     """
     console = Console(stderr=True, markup=False)
+    runs = plan_runs(config, rows)
+    for run in runs:
+        training_config(config, run)  # raises for a refused option, before settings are written
     dataset = open_training_dataset(config.data)
     dataset.select(config.split)  # raises if the dataset has no rounds of this split
-    runs = plan_runs(config, rows)
     if dry_run:
         return _plan_with_times(config, runs, dataset, console)
     for side in ("train", config.split):  # once for all runs

@@ -231,3 +231,23 @@ def test_two_rows_are_trained_and_evaluated(dataset: Path, tmp_path: Path) -> No
     assert multi["frames"] == 5  # every fifth of 24
     text = (config.out / "ablation.html").read_text()
     assert "2 of 2 runs of 10 iterations" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "seen"),
+    [
+        ({"batch": 1}, "--batch is 1"),
+        ({"iterations": 0}, "--iterations is 0"),
+        ({"threads": -1}, "--threads is -1"),
+    ],
+)
+def test_a_refused_option_leaves_no_settings(
+    dataset: Path, tmp_path: Path, changes: dict[str, int], seen: str
+) -> None:
+    """With settings the corrected command would be refused."""
+    config = replace(settings(tmp_path, seeds=(1,), **changes), data=dataset)
+    with pytest.raises(UserError, match=seen):
+        ablate(config, ablation_rows(only="mtl-1"))
+    assert not config.out.exists()
+    with pytest.raises(UserError, match="tune starts from a finished model; give --recipe fast or"):
+        replace(config, recipe="tune")
