@@ -145,8 +145,9 @@ class TrainConfig:
         Option(
             "--change-data",
             help="With --resume: allow another dataset as --data than at the start of the "
-            "training, and other values of --hold-out-drives and --skip-undecodable. For another "
-            "folder as --data, these two options have their defaults unless they are given.",
+            "training, of the same camera, another split of the dataset, and other values of "
+            "--hold-out-drives and --skip-undecodable. For another folder as --data, these two "
+            "options have their defaults unless they are given.",
         ),
     ] = False
 
