@@ -14,6 +14,7 @@ from mtlnet.calibration.drive import calibrate_film
 from mtlnet.calibration.film import DriveCalibration, DriveEstimate
 from mtlnet.calibration.lens import KnownLens, find_lens
 from mtlnet.calibration.mount import NotCalibrated
+from mtlnet.inference.image_decoding.crop import crop_box
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.rectification import Rectification
 from mtlnet.sources.find import Note, Source
@@ -82,18 +83,37 @@ def _lens(size: tuple[int, int], model: CameraParameters, fov_y_deg: float | Non
 
 
 def _of_film(source: Source, model: CameraParameters, given: float | None, note: Note) -> Lens:
-    """The lens estimated from the film's first `FILM_S` seconds; `given` if that fails."""
+    """The lens estimated from the film's first `FILM_S` seconds; the assumed lens if that fails."""
+    assumed: Lens = given
+
+    def make_lens(size: tuple[int, int]) -> KnownLens:
+        nonlocal assumed
+        known = _lens(size, model, given)
+        assumed = _assumed(known, model, given)
+        return known
+
     try:
-        drive = calibrate_film(
-            source.path, lambda size: _lens(size, model, given), longest_s=FILM_S
-        )
+        drive = calibrate_film(source.path, make_lens, longest_s=FILM_S)
         return _rectification(drive.found, model, drive.shown, source.name, note)
     except _ModelsOwn:
         return given
     except (NotCalibrated, ImageError) as error:
-        note(_failed(source.name, error))
+        note(_failed(source.name, error, assumed))
     except (UserError, OSError):  # reported where the film is read
         pass
+    return assumed
+
+
+def _assumed(known: KnownLens, model: CameraParameters, given: float | None) -> Lens:
+    """The lens while no mount is known: `given`, a crop to the model's view. A picture that shows
+    less than this view cannot be cropped to it; its lens is a rectification from `known` with the
+    mount of the model's camera."""
+    camera = known.camera
+    try:
+        crop_box(camera.width, camera.height, model, given)
+    except ImageError:
+        mounted = replace(camera, z=model.z, pitch_deg=model.pitch_deg)
+        return Rectification(mounted, model)
     return given
 
 
@@ -113,14 +133,18 @@ def _rectification(
     return lens
 
 
-def _failed(name: str, error: Exception) -> str:
+def _failed(name: str, error: Exception, assumed: Lens) -> str:
     reason = str(error).removeprefix(f"{name}: ")
-    return f"{name}: no camera found ({reason}); the model's own is assumed; --camera gives another"
+    mount = isinstance(assumed, Rectification)
+    what = "the mount of the model's camera" if mount else "the model's own"
+    return f"{name}: no camera found ({reason}); {what} is assumed; --camera gives another"
 
 
 class DriveLens:
     """Finds the camera of a stream while its pictures arrive. Before the camera is found, the lens
-    is `given`, a vertical field of view in degrees, or None for the model's camera."""
+    is `given`, a vertical field of view in degrees, or None for the model's camera; for pictures
+    that show less than the model's view it is a rectification with the mount of the model's
+    camera."""
 
     def __init__(self, name: str, model: CameraParameters, given: float | None, note: Note) -> None:
         self._name, self._model, self._given, self._note = name, model, given, note
@@ -128,6 +152,7 @@ class DriveLens:
         self._calibration: DriveCalibration | None = None
         self._start_s = 0.0
         self._wait_s = FIRST_S
+        self._found = False
         self._done = False
 
     def at(self, picture: Picture) -> Lens:
@@ -144,6 +169,7 @@ class DriveLens:
             except _ModelsOwn:
                 self._done = True
                 return
+            self._lens = _assumed(lens, self._model, self._given)
             self._calibration = DriveCalibration(lens)
             self._start_s = time_s
         self._calibration.add(image, time_s, bgr=bgr)
@@ -157,6 +183,7 @@ class DriveLens:
         try:
             found = calibration.estimate()
             self._lens = _rectification(found, self._model, [image], self._name, self._note)
+            self._found = True
         except (NotCalibrated, ImageError) as error:
-            if not isinstance(self._lens, Rectification):
-                self._note(_failed(self._name, error) + "; looked for again later")
+            if not self._found:
+                self._note(_failed(self._name, error, self._lens) + "; looked for again later")

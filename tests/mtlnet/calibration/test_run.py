@@ -16,9 +16,10 @@ from mtlnet.calibration.run import calibrate
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.lenses import DriveLens, with_lens
+from mtlnet.sources.films import Film
 from mtlnet.sources.find import Source
 from mtlnet.sources.kinds import SourceKind
-from mtlnet.sources.pictures import Picture
+from mtlnet.sources.pictures import Picture, fit
 from runtime.camera_file import read_camera
 from runtime.film import Mp4Writer
 from tests.mtlnet.calibration.drawn import board_pictures, chessboard, road_picture
@@ -218,11 +219,41 @@ def test_a_stream_is_calibrated_while_it_runs() -> None:
     finder = DriveLens("webcam 0", MODEL, 60.0, lines.append)
     picture = road_picture(CAMERA, MARKINGS_M)
     lenses = [finder.at(Picture(k, picture, 1e9 + 0.2 * k, bgr=True)) for k in range(80)]
-    assert lenses[74] == 60.0
+    assert isinstance(lenses[74], Rectification)
     assert isinstance(lenses[75], Rectification)
+    assert (lenses[74].source.fov_y_deg, lenses[74].source.pitch_deg) == (60.0, MODEL.pitch_deg)
     assert lenses[75].source.pitch_deg == pytest.approx(2.0, abs=0.15)
     assert len(lines) == 1
     own = DriveLens("webcam 0", MODEL, None, lines.append)
     wanted = road_picture(replace(MODEL, pitch_deg=3.0), MARKINGS_M)
     assert {own.at(Picture(k, wanted, 0.2 * k)) for k in range(80)} == {None}
     assert len(lines) == 1
+
+
+@pytest.mark.parametrize(
+    ("size", "fov_y_deg"), [((1280, 720), 43.0), ((1280, 1024), None), ((720, 1280), None)]
+)
+def test_a_stream_of_a_narrow_camera_is_answered_before_it_is_calibrated(
+    size: tuple[int, int], fov_y_deg: float | None
+) -> None:
+    lines: list[str] = []
+    picture = Picture(0, np.zeros((size[1], size[0], 3), np.uint8), 1e9, bgr=True)
+    finder = DriveLens("webcam 0", MODEL, fov_y_deg, lines.append)
+    assert fit(picture, MODEL, finder.at(picture)).shape == (210, 280, 3)
+    assert lines == []
+    for later_s in (15.0, 30.0):
+        finder.at(replace(picture, time_s=1e9 + later_s))
+    assert len(lines) == 2
+    assert all("the mount of the model's camera is assumed" in line for line in lines)
+
+
+def test_a_film_of_a_narrow_camera_without_markings_is_answered(tmp_path: Path) -> None:
+    path = _no_markings(tmp_path / "none.mp4")
+    lines: list[str] = []
+    source = Source(path, SourceKind.FILM)
+    lens = with_lens(source, MODEL, 60.0, lines.append, calibrate=True).lens
+    assert isinstance(lens, Rectification)
+    picture = next(iter(Film(path).pictures()))
+    assert fit(picture, MODEL, lens).shape == (210, 280, 3)
+    assert lens.source.z == MODEL.z
+    assert "the mount of the model's camera is assumed" in lines[0]
