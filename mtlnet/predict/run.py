@@ -16,7 +16,7 @@ from mtlnet.inference.engine import Engine
 from mtlnet.inference.prediction import Prediction, decode_outputs
 from mtlnet.predict.lenses import with_lens
 from mtlnet.predict.writers import Writer, check_outputs, open_writer, require_inputs_kept
-from mtlnet.sources.find import DEFAULT_FPS, Note, find_sources
+from mtlnet.sources.find import DEFAULT_FPS, Note, Source, find_sources
 from mtlnet.sources.kinds import SourceKind
 from mtlnet.sources.pictures import Lens
 from mtlnet.sources.read import READ_AHEAD, SourceImage, read_sources
@@ -93,10 +93,22 @@ def predict_files(
             if not any(source.kind is SourceKind.STREAM for source in usable):
                 raise
             note(f"stopped after {answers.used} images")
-    for source in sources:
-        if isinstance(source.opened, Stream) and source.opened.note:
-            note(source.opened.note)
+    _report_streams(sources, answers, note)
     return answers.finish()
+
+
+def _report_streams(sources: Sequence[Source], answers: "_Answers", note: Note) -> None:
+    """Report the end of each stream, and the damage of a stream that Ctrl-C has ended."""
+    for source in sources:
+        stream = source.opened
+        if not isinstance(stream, Stream):
+            continue
+        if stream.note:
+            note(stream.note)
+        elif stream.fault:
+            answers.fail(stream.fault)
+        elif stream.damaged:
+            answers.fail(f"{stream.name}: {stream.damage()}")
 
 
 def answer(engine: Engine, item: SourceImage) -> Prediction:
@@ -138,6 +150,11 @@ class _Answers:
             about = {"model": self._engine.card.name, "latency_ms": latency_ms}
             row = {"image": item.name, "time_s": item.time_s, **prediction.as_json(), **about}
             self._results.append(row)
+
+    def fail(self, error: str) -> None:
+        """Add an error, unless the item that reports it has been added."""
+        if error not in self._unusable:
+            self._unusable.append(error)
 
     def finish(self) -> list[dict[str, Any]]:
         """The results of the first `KEPT_ROWS` images. Raises InputsLeftOut when an image could not

@@ -96,6 +96,10 @@ class Stream:
                 yield Picture(number, image, time.time(), bgr=True)
                 number += 1
 
+    def damage(self) -> str:
+        """Return a text about the damaged pictures."""
+        return f"{self.damaged} of its pictures came damaged and may be wrong ({self.first_error})"
+
     def _note_damage(self, number: int) -> None:
         """Count a picture in which FFmpeg reported an error. Picture 0 is not counted, because a
         stream joined between key frames starts with errors."""
@@ -117,10 +121,7 @@ class Stream:
                 "check camera and network"
             )
         elif self.damaged:
-            self.fault = (
-                f"{self.name} ended after {number} pictures; {self.damaged} came damaged and may "
-                f"be wrong ({self.first_error})"
-            )
+            self.fault = f"{self.name} ended after {number} pictures; {self.damage()}"
         else:
             self.note = f"{self.name} ended after {number} pictures"
 

@@ -7,8 +7,10 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -16,7 +18,10 @@ import simplejpeg
 
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.sources import streams
-from mtlnet.sources.streams import is_live, shown_name
+from mtlnet.sources.ffmpeg_log import DecodingErrors
+from mtlnet.sources.find import Source
+from mtlnet.sources.kinds import SourceKind
+from mtlnet.sources.streams import Stream, is_live, shown_name
 from tests.mtlnet.predict.brightness_engine import BrightnessEngine
 from trackfeatures.errors import UserError
 
@@ -80,7 +85,7 @@ def test_a_stream_is_answered_to_its_end(
     ("mode", "message"),
     [
         ("stall", r"sent nothing for 1 s after 5 pictures; these pictures were used"),
-        ("cut", r"ended after 6 pictures; 1 came damaged and may be wrong \(.+\)"),
+        ("cut", r"ended after 6 pictures; 1 of its pictures came damaged and may be wrong \(.+\)"),
         ("smaller", r"picture 5 is 280 x 210 px, those before it are 560 x 420 px and were used"),
     ],
 )
@@ -153,6 +158,35 @@ def test_ctrl_c_ends_a_stream_and_keeps_its_answers(engine: BrightnessEngine, ad
     rows = predict_files(engine, [f"{address}/end"], report=interrupt, note=notes.append)
     assert len(rows) == 3
     assert notes == ["stopped after 3 images"]
+
+
+@pytest.mark.parametrize("count", [4, 100])  # 4: the fault is known, but its item is still waiting
+def test_ctrl_c_tells_damaged_pictures(engine: BrightnessEngine, count: int) -> None:
+    errors = DecodingErrors()
+    numbers = iter(range(count))
+
+    def read() -> tuple[bool, np.ndarray | None]:
+        number = next(numbers, None)
+        if number == 2:
+            errors.add("[h264 @ 0x1] error while decoding MB 12 7")
+        time.sleep(0.01)
+        return number is not None, np.zeros((210, 280, 3), np.uint8)
+
+    live = Stream("webcam 0", Mock(read=read), errors, ExitStack())
+    source = Source(Path("0"), SourceKind.STREAM, 0, 30.0, address="webcam 0", opened=live)
+
+    def interrupt(done: int, total: int) -> None:
+        if done == 4:
+            time.sleep(0.2)
+            raise KeyboardInterrupt
+
+    message = r"^webcam 0.* 1 .*came damaged and may be wrong \(error while .*; 3 images done$"
+    with (
+        patch("mtlnet.predict.run.find_sources", return_value=[source]),
+        pytest.raises(InputsLeftOut, match=message) as raised,
+    ):
+        predict_files(engine, ["0"], report=interrupt)
+    assert len(raised.value.results) == 3
 
 
 @pytest.mark.parametrize(
