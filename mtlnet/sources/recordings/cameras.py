@@ -12,7 +12,7 @@ import numpy as np
 
 from mtlnet.sources.recordings.images import CALIBRATION, ROS_CALIBRATION
 from mtlnet.sources.recordings.topic import Topic
-from runtime.camera_file import read_distortion
+from runtime.camera_file import MODELS, read_distortion
 from trackfeatures.camera import CameraError, CameraParameters
 from trackfeatures.errors import UserError
 
@@ -82,7 +82,8 @@ def is_models(camera: CameraParameters, model: CameraParameters) -> bool:
 
 
 def _lens(model: str, distortion: Any) -> dict[str, Any]:
-    if not distortion.any():
+    is_fisheye = MODELS.get(model.lower()) == "fisheye"  # with all coefficients 0: r = f * angle
+    if not distortion.size or not (is_fisheye or distortion.any()):
         return {"distortion": "none", "coefficients": ()}
     return read_distortion(model, distortion.tolist())
 

@@ -55,6 +55,11 @@ def bag(folder: Path, camera: dict[str, Any], topic: str = "/cam/image_raw") -> 
             (0.1, 0.01, 0.0, 0.0),
             replace(OURS, distortion="fisheye", coefficients=(0.1, 0.01, 0.0, 0.0)),
         ),
+        (
+            "Equidistant",
+            (0.0,) * 4,
+            replace(OURS, distortion="fisheye", coefficients=(0.0,) * 4),
+        ),
     ],
 )
 def test_a_bag_states_matrix_and_distortion(
