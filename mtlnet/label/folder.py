@@ -49,8 +49,9 @@ class LabelFolder:
 
         `camera_file`: camera of the pictures whose row names no camera; the file is copied into a
         folder that has no camera file. `model`: camera of the model, whose values replace values
-        that are missing in a camera file. Raises UserError for a folder without pictures or camera,
-        a faulty `labels.csv`, and a camera file that differs from the file in the folder.
+        that are missing in a camera file. Raises UserError for a folder without pictures; for a
+        folder without a camera file in which no row names a camera; for a faulty `labels.csv`; and
+        for a camera file that differs from the file in the folder.
         """
         if not folder.is_dir():
             raise UserError(f"there is no folder {folder}; give one with pictures")
@@ -74,8 +75,7 @@ class LabelFolder:
                 )
             if not own.exists():
                 write_camera(own, camera, f"From {camera_file.name}, by `mtlnet label`.")
-        missing = [row["file"] for row in self.rows().values() if not row.get("camera")]
-        named = len(self.rows()) == len(self.files) and not missing
+        named = any(row.get("camera") for row in self.rows().values())
         if not own.exists() and not named:
             raise UserError(
                 f"{folder} has no {CAMERA_FILE}, which is needed to compute metres: "
@@ -136,10 +136,17 @@ class LabelFolder:
         """Return the camera of picture `number`, resized to the picture's width and height (px).
 
         Its pitch is the pitch in the camera file, not the pitch in the picture's row. Raises
-        UserError for a faulty camera file, and for a camera with another aspect ratio.
+        UserError if no camera is known, for a faulty camera file, and for a camera with another
+        aspect ratio.
         """
-        name = self._last_row(self.files[number]).get("camera") or CAMERA_FILE
+        named = self._last_row(self.files[number]).get("camera")
+        name = named or CAMERA_FILE
         path = self.folder / name
+        if not named and not path.is_file():
+            raise UserError(
+                f"no camera is known for {self.files[number]}: start again with --camera FILE, "
+                f"which adds {CAMERA_FILE} to the folder"
+            )
         if not path.resolve().is_relative_to(self.folder):
             raise UserError(f"the camera {name} leads out of the folder")
         camera = read_camera(path, self._model)

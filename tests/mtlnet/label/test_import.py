@@ -76,6 +76,19 @@ def test_a_camera_file_has_the_median_pitch_of_its_pictures(tmp_path: Path) -> N
     assert pitches == pytest.approx([median] * 4 + [0.0], abs=1e-4)
 
 
+def test_an_imported_folder_opens_after_a_label_was_removed(tmp_path: Path) -> None:
+    path = table(tmp_path / "theirs", ROW, "b.png,1.7,-1.9,0,40,1.22", head=HEAD)
+    mine = tmp_path / "mine"
+    import_labels(path, mine)
+    LabelFolder(mine, None, CameraParameters()).remove(0)
+    folder = LabelFolder(mine, None, CameraParameters())
+    assert folder.camera(1, 640, 360).fov_y_deg == pytest.approx(40)
+    with pytest.raises(UserError, match=r"no camera is known for a\.png: .*--camera FILE"):
+        folder.camera(0, 640, 360)
+    again = LabelFolder(mine, mine / "cameras" / "640x360-40deg.yaml", CameraParameters())
+    assert again.camera(0, 640, 360) == again.camera(1, 640, 360)
+
+
 @pytest.mark.parametrize(
     ("row", "seen"),
     [
