@@ -147,9 +147,9 @@ class Model:
         2 bag, webcam number or address of a stream (all as text, as for `mtlnet predict`) it is an
         iterator, which reads and predicts image by image. `camera`: a camera file or
         CameraParameters of the images; "model": the model's camera took them; None: as with
-        "model", except that the camera of a film or stream is estimated from its pictures. With
-        "model" and None, the camera that a recording states has precedence. `fov_y_deg`: vertical
-        field of view of the images in degrees, if no `camera` is given; not for a recorded round.
+        "model", except that the camera of a film or stream is estimated from its pictures, and that
+        the camera that a recording states is used. `fov_y_deg`: vertical field of view of the
+        images in degrees, if no `camera` is given; not for a recorded round.
         `topic`: topic with the pictures of a recording.
 
         Raises UserError for a source of another type or that cannot be used (ImageError for one
@@ -161,7 +161,7 @@ class Model:
         if isinstance(source, str | Path):
             sources = find_sources([str(source)], log.info, topic)
             if [(s.path, s.kind) for s in sources] != [(Path(source), SourceKind.IMAGE)]:
-                return self._all(sources, lens, calibrate=camera is None)
+                return self._all(sources, lens, own=camera is not None)
             if sources[0].problem:
                 raise UserError(sources[0].problem)
         elif topic:
@@ -195,8 +195,10 @@ class Model:
         known = lens if isinstance(lens, Rectification) else None
         return self._answer(SourceImage(name, None, small, lens=known), lens)
 
-    def _all(self, sources: list[Source], lens: Lens, *, calibrate: bool) -> Iterator[Features]:
-        found = [with_lens(s, self.camera, lens, log.info, calibrate=calibrate) for s in sources]
+    def _all(self, sources: list[Source], lens: Lens, *, own: bool) -> Iterator[Features]:
+        """`own`: no camera is estimated or taken from a recording."""
+        options = {"calibrate": not own, "stated": not own}
+        found = [with_lens(s, self.camera, lens, log.info, **options) for s in sources]
         unusable: list[str] = []
         items = read_sources(found, self.camera)
         try:

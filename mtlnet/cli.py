@@ -241,10 +241,9 @@ def predict_command(
         if camera is not None and not own:
             lens = Rectification(read_camera(camera, known, note), known)
         left_out: InputsLeftOut | None = None
+        given = (loaded, images, out or (), lens, report, note, topic)
         try:
-            predictions = predict_files(
-                loaded, images, out or (), lens, report, note, topic, calibrate=not own
-            )
+            predictions = predict_files(*given, calibrate=not own, stated=not own)
         except InputsLeftOut as error:
             predictions, left_out = error.results, error
     if as_json and predictions:

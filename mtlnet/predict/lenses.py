@@ -35,11 +35,17 @@ class _ModelsOwn(Exception):
 
 
 def with_lens(
-    source: Source, model: CameraParameters, given: Lens, note: Note, *, calibrate: bool = False
+    source: Source,
+    model: CameraParameters,
+    given: Lens,
+    note: Note,
+    *,
+    calibrate: bool = False,
+    stated: bool = True,
 ) -> Source:
-    """Return `source` with the camera that took its pictures: `given`, else the camera that a
-    recording states, else with `calibrate` a camera estimated from the pictures of the film or
-    stream, else the camera `model` of the model.
+    """Return `source` with the camera that took its pictures: `given`, else with `stated` the
+    camera that a recording states, else with `calibrate` a camera estimated from the pictures of
+    the film or stream, else the camera `model` of the model.
 
     `given` is a rectification from this camera to the model's, the vertical field of view in
     degrees, or None. For a field of view, `calibrate` estimates only the mount. `note` is called
@@ -47,10 +53,11 @@ def with_lens(
     """
     if isinstance(given, Rectification) or source.problem or source.kind is SourceKind.ROUND:
         return replace(source, lens=given)
-    if given is None and source.kind is SourceKind.RECORDING and source.opened is not None:
-        stated = _stated(source, model, note)
-        if stated is not None:
-            return stated
+    is_recording = source.kind is SourceKind.RECORDING and source.opened is not None
+    if stated and given is None and is_recording:
+        found = _stated(source, model, note)
+        if found is not None:
+            return found
     if calibrate and source.kind is SourceKind.FILM:
         return replace(source, lens=_of_film(source, model, given, note))
     if calibrate and source.kind is SourceKind.STREAM:

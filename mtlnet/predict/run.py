@@ -47,6 +47,7 @@ def predict_files(
     topic: str = "",
     *,
     calibrate: bool = False,
+    stated: bool = True,
 ) -> list[dict[str, Any]]:
     """Predict the features of all images that `inputs` name (`mtlnet.sources.find.find_sources`).
 
@@ -54,11 +55,10 @@ def predict_files(
     of `outputs` (`mtlnet.predict.writers.open_writer`), image by image. The outputs are opened when
     the first image has been answered; earlier files are kept if no image can be used. `lens`: the
     lens of all sources except recorded rounds, which must be of the model's camera; None: the lens
-    that a recording states or that is estimated, else the model's. `report`: called with the
-    numbers of images done and in total. `note`: called with a line about files that are left out
-    and cameras that are found. `topic`: the topic to read from recordings; empty: the only topic
-    with pictures. `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C
-    ends a stream normally.
+    that a recording states (with `stated`) or that is estimated, else the model's. `report`: called
+    with the numbers of images done and in total. `note`: called with a line about files left out
+    and cameras found. `topic`: topic to read from recordings; empty: the only topic with pictures.
+    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends streams.
 
     Raises InputsLeftOut, after all other images are done, when an input or an image could not be
     used; UserError at once for an invalid `lens`, and for outputs that cannot be written, are
@@ -74,7 +74,9 @@ def predict_files(
     for source in sources:
         if source.problem and len(sources) > 1:  # the problem of a single source is the error
             note(source.problem)
-    sources = [with_lens(source, camera, lens, note, calibrate=calibrate) for source in sources]
+    sources = [
+        with_lens(s, camera, lens, note, calibrate=calibrate, stated=stated) for s in sources
+    ]
     answers = _Answers(engine, sum(source.count for source in sources), report)
     fps = usable[0].fps if usable else DEFAULT_FPS
 

@@ -1,13 +1,16 @@
 """The camera that a recording states: choice of the topic, its values, and its use."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from mtlnet.api import load
 from mtlnet.inference.rectification import Rectification
 from mtlnet.predict.run import predict_files
 from mtlnet.sources.recordings.cameras import calibration_topic
@@ -22,6 +25,7 @@ from tests.mtlnet.sources.recorded import (
     write_bag,
     write_foxglove,
 )
+from tests.typed import typed
 from trackfeatures.camera import CameraParameters
 
 SIZE, MATRIX = (560, 420), (400.0, 410.0, 270.0, 200.0)
@@ -138,6 +142,22 @@ def test_pictures_are_taken_by_the_stated_camera_unless_one_is_given(
         (wide,) = predict_files(engine, [str(path)], lens=90.0, note=notes.append)
         assert given["angle_rad"] == own["angle_rad"] != wide["angle_rad"]
         assert len(notes) == 1
+
+
+def test_the_option_camera_model_has_precedence_over_a_stated_camera(
+    published: Path, tmp_path: Path
+) -> None:
+    path = bag(tmp_path / "bag", ros_camera(SIZE, MATRIX, "plumb_bob", DISTORTION))
+    cv2.imwrite(str(tmp_path / "a.png"), IMAGE[..., ::-1])
+    given = ("mtlnet", "predict", "--model", published, path, "--json")
+    own, stated = typed(*given, "--camera", "model"), typed(*given)
+    assert "come from /cam/camera_info" in stated.stderr
+    assert "camera_info" not in own.stderr
+    model = load(published)
+    picture = model.predict(tmp_path / "a.png").angle_rad
+    (features,) = model.predict(str(path), camera="model")
+    assert features.angle_rad == picture == json.loads(own.stdout)[0]["angle_rad"]
+    assert json.loads(stated.stdout)[0]["angle_rad"] != picture
 
 
 @pytest.mark.parametrize(
