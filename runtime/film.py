@@ -1,6 +1,7 @@
 """Writes images to a video file (MPEG-4, .mp4), and reads the boxes of MP4 files."""
 
 from collections.abc import Iterator
+from math import log10
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -12,6 +13,8 @@ from runtime.files import utf8_path
 from trackfeatures.errors import UserError
 
 FILM_SUFFIX = ".mp4"
+MAX_RATE = 65_535
+"""Maximum N of a frame rate N / 10^n of MPEG-4, the form in which OpenCV writes it."""
 BOX_HEAD = 8
 
 
@@ -24,7 +27,8 @@ class Mp4Writer:
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        self._path, self._fps = path, fps
+        digits = max(int(log10(MAX_RATE / fps)), 0)
+        self._path, self._fps = path, round(fps, digits)
         self._film: cv2.VideoWriter | None = None
 
     def write(self, picture: NDArray[np.uint8]) -> None:
