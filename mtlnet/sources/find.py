@@ -157,7 +157,7 @@ def _source(path: Path, kind: SourceKind, topic: str) -> Source:
             from mtlnet.sources.recordings.recording import open_recording
 
             found = open_recording(path, topic)
-            return Source(path, kind, found.count, opened=found)
+            return Source(path, kind, found.count, found.fps() or DEFAULT_FPS, opened=found)
         if kind is SourceKind.FILM:
             header = read_film_header(path)
             return Source(path, kind, header.count, header.fps or DEFAULT_FPS)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,10 @@ from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 KNOWN = ", ".join(IMAGES)
+TIMED_PICTURES = 41
+MAX_FPS, LONGEST_STEP_S = 1000.0, 10.0
+"""Limits of the rate and of the mean time between pictures, beyond which the rate counts as
+unknown."""
 
 
 @dataclass
@@ -40,6 +45,16 @@ class Recording:
     def count(self) -> int:
         """Number of pictures; 0 if it is unknown."""
         return self.topic.count or 0
+
+    def fps(self) -> float:
+        """Return the mean number of pictures per second, from the log times of the first
+        `TIMED_PICTURES`; 0 if it is unknown."""
+        messages = islice(self.container.messages(self.topic.name), TIMED_PICTURES)
+        times_ns = [time_ns for time_ns, _ in messages]
+        if len(times_ns) < 2:
+            return 0.0
+        step_s = (times_ns[-1] - times_ns[0]) / NANOSECONDS / (len(times_ns) - 1)
+        return 1 / step_s if 1 / MAX_FPS < step_s < LONGEST_STEP_S else 0.0
 
     def pictures(self) -> Iterator[Picture]:
         """Yields each message's picture, numbered from 0, with the time in its header, or its log

@@ -238,6 +238,29 @@ def test_pictures_that_change_their_size_end_the_recording(
     assert len(raised.value.results) == 2
 
 
+@pytest.mark.parametrize(
+    ("storage", "count", "step_s", "fps"),
+    [
+        (StoragePlugin.MCAP, 5, 0.1, 10.0),
+        (StoragePlugin.SQLITE3, 60, 1 / 30, 30.0),
+        (StoragePlugin.MCAP, 1, 0.1, 20.0),  # unknown
+        (StoragePlugin.MCAP, 3, 0.0, 20.0),
+    ],
+)
+def test_the_drawn_film_of_a_recording_has_its_frame_rate(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    storage: StoragePlugin,
+    count: int,
+    step_s: float,
+    fps: float,
+) -> None:
+    monkeypatch.setattr("tests.mtlnet.sources.recorded.STEP_NS", round(step_s * 1e9))
+    grey = ros_image(np.full((21, 28), 90, np.uint8), "mono8")
+    bag = write_bag(tmp_path / "bag", [(CAMERA, "Image", grey)] * count, storage)
+    assert find_sources([str(bag)])[0].fps == pytest.approx(fps, rel=1e-6)
+
+
 @pytest.mark.slow
 def test_the_command_takes_a_topic_and_tells_of_the_camera(tmp_path: Path) -> None:
     """The darker of two cameras is chosen; standard output has only the answers."""
