@@ -314,7 +314,7 @@ LabelStdGiven = Annotated[
         "--label-std",
         help="With --import: standard deviations of the labelled distances (m) and angles "
         "(rad) as METRES,RADIANS for all files, or as PATTERN=METRES,RADIANS for the "
-        "files whose names match the wildcard PATTERN. Can be repeated; the last match "
+        "files whose path or name matches the wildcard PATTERN. Can be repeated; the last match "
         "counts.",
         show_default="none",
     ),

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from statistics import median
 from typing import Any
 
@@ -41,11 +41,15 @@ CAMERAS = "cameras"
 @dataclass(frozen=True)
 class LabelStd:
     """Standard deviations of the labelled distances (`metres`) and angles (`radians`) in the files
-    whose names match the wildcard `pattern`."""
+    that match the wildcard `pattern`."""
 
     pattern: str
     metres: float
     radians: float
+
+    def applies_to(self, file: str) -> bool:
+        """Return whether the path of a file, or its name without the folders, matches."""
+        return any(fnmatchcase(name, self.pattern) for name in (file, PurePosixPath(file).name))
 
 
 def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
@@ -69,10 +73,11 @@ def parse_label_std(texts: Sequence[str]) -> list[LabelStd]:
 def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> dict[str, Any]:
     """Copy the pictures of a table to `folder`, with `labels.csv` and camera files.
 
-    A file gets the standard deviations of the last entry of `stds` whose pattern matches its name.
-    Returns a dict: `folder`, and the numbers of `pictures` and `cameras`. Raises UserError for a
-    faulty row, if `folder` has labels already, and if a picture would replace another file; then
-    nothing is written. A picture that is already in `folder` is not copied.
+    A file gets the standard deviations of the last entry of `stds` whose pattern matches its path
+    or name. Returns a dict: `folder`, and the numbers of `pictures` and `cameras`. Raises UserError
+    for a faulty row, for a pattern that matches no file, if `folder` has labels already, and if a
+    picture would replace another file; then nothing is written. A picture that is already in
+    `folder` is not copied.
     """
     if (folder / LABELS).exists():
         raise UserError(f"{folder / LABELS} exists; give a new folder")
@@ -85,6 +90,12 @@ def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> d
         except (UserError, ValueError) as error:
             raise UserError(f"{table}, line {line}: {error}") from None
         found.append((camera, cells))
+    for std in stds:
+        if not any(std.applies_to(cells["file"]) for _, cells in found):
+            raise UserError(
+                f"--label-std '{std.pattern}={std.metres:g},{std.radians:g}': no file of {table} "
+                "matches the pattern"
+            )
     pitches: dict[CameraParameters, list[float]] = {}
     for camera, cells in found:
         given = [float(cells["pitch_deg"])] if "pitch_deg" in cells else []
@@ -171,7 +182,7 @@ def _converted(
         down = (height - 1) / 2 - _number(row, "horizon_y_px")
         cells["pitch_deg"] = f"{math.degrees(math.atan2(down, _number(row, 'focal_px'))):.6g}"
     for std in stds:
-        if fnmatchcase(row["file"], std.pattern):
+        if std.applies_to(row["file"]):
             cells.update(std_m=f"{std.metres:g}", std_rad=f"{std.radians:g}")
     return camera, cells
 

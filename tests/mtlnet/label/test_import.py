@@ -1,6 +1,7 @@
 """Tables of other terms become a folder that `evaluate` reads; faulty ones are one clear line."""
 
 import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -110,6 +111,26 @@ def test_a_faulty_row_is_refused(tmp_path: Path, row: str, seen: str) -> None:
     with pytest.raises(UserError, match=seen):
         import_labels(path, tmp_path / "mine")
     assert not (tmp_path / "mine").exists()
+
+
+def test_a_pattern_of_standard_deviations_matches_files_in_folders(tmp_path: Path) -> None:
+    names = ("day_1.png", "night_1.png")
+    rows = [f"{folder}/{name},1.7,-1.9,0,40,1.22" for folder in ("c", "d") for name in names]
+    path = table(tmp_path / "theirs", *rows, head=HEAD)
+    for folder in ("c", "d"):
+        (path.parent / folder).mkdir()
+        for name in names:
+            shutil.copy(path.parent / "a.png", path.parent / folder / name)
+    stds = parse_label_std(["0.06,0.006", "night_*=0.16,0.012", "d/night*=0.2,0.02"])
+    import_labels(path, tmp_path / "mine", stds)
+    pictures, _ = read_labels(tmp_path / "mine" / "labels.csv")
+    assert [p.std_m for p in pictures] == [0.06, 0.16, 0.06, 0.2]
+    wrong = parse_label_std(["0.06,0.006", "nigt_*=0.16,0.012"])
+    with pytest.raises(
+        UserError, match=r"--label-std 'nigt_\*=0\.16,0\.012': no file of .* matches"
+    ):
+        import_labels(path, tmp_path / "other", wrong)
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_table_in_latin_1_names_files_by_their_bytes(tmp_path: Path) -> None:
