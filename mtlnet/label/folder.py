@@ -30,7 +30,7 @@ from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
 from trackfeatures.definitions import MARKINGS
 from trackfeatures.errors import UserError
-from trackfeatures.road_class import BEND_CURVATURE
+from trackfeatures.road_class import classify_heading
 
 KEPT = ("drive", "light", "camera", "std_m", "std_rad")
 """Columns whose values stay when a label is saved, unless the page sends new ones."""
@@ -180,9 +180,7 @@ class LabelFolder:
         Raises LabelChangedError if the row has another version, and UserError for a label out of
         range.
         """
-        if not heading:
-            bend = "left" if markings.curvature > 0 else "right"
-            heading = bend if abs(markings.curvature) >= BEND_CURVATURE else "straight"
+        heading = heading or heading_of(markings)
         with self._lock:
             name, before = self._checked_row(number, version)
             old = self._last_row(name)
@@ -246,6 +244,11 @@ class LabelFolder:
             write_cells(self.folder / LABELS, [rows[k] for k in sorted(rows, key=natural_key)])
         else:
             (self.folder / LABELS).unlink(missing_ok=True)
+
+
+def heading_of(markings: Markings) -> str:
+    """Return the class of the road that follows from the curvature of the markings."""
+    return classify_heading(markings.curvature, markings.curvature).name.lower()
 
 
 def row_version(row: Cells | None) -> str:

@@ -28,7 +28,7 @@ from mtlnet.inference.engine import Engine
 from mtlnet.inference.image_decoding.errors import ImageError
 from mtlnet.inference.prediction import decode_outputs
 from mtlnet.inference.rectification import Rectification
-from mtlnet.label.folder import LabelChangedError, LabelFolder, row_version
+from mtlnet.label.folder import LabelChangedError, LabelFolder, heading_of, row_version
 from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
 from runtime.access import HostNames
 from runtime.files import locked_folder, name_as_text
@@ -124,6 +124,7 @@ class Labeller:
         `source` states which of these three cases applies: "label", "model" or "usual". A label
         without a lane counts as no label here, and `note` describes this. `camera_pitch_deg` is the
         pitch in the camera file; the markings have the pitch in the row, if the row has one.
+        `heading` is the class in the row; "" if it follows from the label's markings.
         """
         image = self.folder.picture(number)
         height, width = image.shape[:2]
@@ -135,6 +136,7 @@ class Labeller:
         answer, note = (None, "") if label else self._answer(image, camera)
         if row is not None and label is None:
             note = "the label has no lane; saving would replace it by the drawn lane"
+        heading = (row or {}).get("heading", "")
         usual = Markings(*USUAL_LANE, camera.pitch_deg)
         return {
             "file": name_as_text(self.folder.files[number]),
@@ -142,6 +144,7 @@ class Labeller:
             "height": height,
             "camera_pitch_deg": in_file.pitch_deg,
             "row": row_as_text(row),
+            "heading": "" if label and heading == heading_of(label) else heading,
             "version": row_version(row),
             "source": "label" if label else "model" if answer else "usual",
             "note": note,

@@ -63,7 +63,7 @@ async function open(n) {
     shown = structuredClone(data);
     pictures[n].labelled = shown.row !== null; // another page may have changed it
     image = bitmap;
-    $("heading").value = shown.row ? shown.row.heading : "";
+    $("heading").value = shown.heading;
     if (shown.row) { $("drive").value = shown.row.drive || ""; $("light").value = shown.row.light || ""; }
     say(shown.note);
   } catch (error) {

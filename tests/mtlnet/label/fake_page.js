@@ -1,7 +1,8 @@
 // Runs label.js with a fake page and a fake server of four pictures, presses keys, and prints what
 // the server received and what the page shows, as JSON.
 // Usage: node fake_page.js LABEL_JS LABELLED KEYS
-// LABELLED: numbers of the labelled pictures, with commas between them; "0-": the label has no lane.
+// LABELLED: numbers of the labelled pictures, with commas between them; "0-": the label has no lane;
+// "0s": its class "straight" follows from its lines.
 // KEYS: names of keys with commas between them; they are pressed without a pause. "." waits until
 // all requests are answered, "fail" makes the next request fail, "show N" opens picture N, "drag"
 // edits the picture, "other N" is another page that labels picture N or removes its label.
@@ -21,9 +22,10 @@ const element = (id) => (elements[id] ||= {
   getContext: () => ink, getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {},
 });
 const pair = (value) => ({ left: structuredClone(value), right: structuredClone(value) });
-const row = (n) => (labels[n] ? { file: `${n}.png`, heading: "left" } : null);
+const row = (n) => (labels[n] ? { file: `${n}.png`, heading: labels[n].endsWith("s") ? "straight" : "left" } : null);
 const picture = (n) => ({
   file: `${n}.png`, width: 100, height: 75, camera_pitch_deg: 0, note: "",
+  heading: labels[n]?.endsWith("s") ? "" : row(n)?.heading ?? "",
   row: row(n), version: String(versions[n]), source: labels[n] && !labels[n].endsWith("-") ? "label" : "model",
   markings: { ml: -1 - n / 10, mr: 2, angle: 0, curvature: 0, pitch_deg: 0 },
   lines: pair([[0, 0], [1, 75]]), handles: pair([[1, 70], [2, 60], [3, 50]]),

@@ -34,6 +34,9 @@ def press(labelled: str, keys: str) -> dict[str, Any]:
         ("", "Enter,3", ["PUT 0 -1 "], 1),
         ("", "Enter,ArrowRight,.,u", ["PUT 0 -1 ", "UNDO 0"], 0),
         ("", "Enter,.,Enter", ["PUT 0 -1 ", "PUT 1 -1.1 "], 2),
+        # A class that follows from the lines is derived again, unless a key sets it.
+        ("0s", "show 0,drag,Enter", ["PUT 0 -1.77 "], 1),
+        ("0s", "show 0,2,drag,Enter", ["PUT 0 -1.77 straight"], 1),
         # The same holds for an undo and a removal.
         ("", "Enter,.,u,ArrowRight", ["PUT 0 -1 ", "UNDO 0"], 0),
         ("", "Enter,.,u,u", ["PUT 0 -1 ", "UNDO 0"], 0),

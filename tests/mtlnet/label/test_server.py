@@ -315,11 +315,20 @@ def test_the_kept_pitch_is_that_of_the_camera_file(site: Site) -> None:
     assert removed["markings"]["pitch_deg"] == 1.0
 
 
+def test_a_class_that_follows_from_the_lines_is_not_shown_as_chosen(site: Site) -> None:
+    cases = [(0.0, "", ""), (0.02, "", ""), (0.0, "left", "left"), (0.02, "?", "?")]
+    for curvature, given, shown in cases:
+        body = {**LABEL, "curvature": curvature, "heading": given}
+        assert site.ask("PUT", "/api/pictures/0/label", body)[0] == 200
+        assert site.ask("GET", "/api/pictures/0")[1]["heading"] == shown
+    assert site.ask("GET", "/api/pictures/1")[1]["heading"] == ""  # without a label
+
+
 def test_the_label_of_a_picture_without_a_lane_is_pointed_out(site: Site) -> None:
     head = "file,ml,mr,l,m,r,angle,heading,drive,pitch_deg,std_m"
     (site.folder / "labels.csv").write_text(f"{head}\n{LANELESS}\n")
     _, shown, _ = site.ask("GET", "/api/pictures/0")
-    assert (shown["source"], shown["row"]["heading"]) == ("usual", "straight")
+    assert (shown["source"], shown["heading"]) == ("usual", "straight")
     assert "the label has no lane" in shown["note"]
 
 
