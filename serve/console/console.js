@@ -6,18 +6,37 @@ import { createLive } from "./live.js";
 
 const KEPT = 120, EVERY_MS = 100;
 const $ = (id) => document.getElementById(id);
-const model = await (await fetch("model")).json();
+let model = null; // the model card
 const latencies = [];
 let current = null; // {body, image, truth}
 let asking = false;
 
-$("model").textContent =
-  `model ${model.model.slice(0, 12)}, ${model.engine} ${model.precision}, ` +
-  `camera ${model.camera.width} × ${model.camera.height}, ${model.camera.fov_y_deg}° vertical`;
 $("base").textContent = location.origin;
+
+const authorization = () => ($("token").value ? { Authorization: `Bearer ${$("token").value}` } : {});
+
+// Loads and shows the model card, then sends the current picture. After a 401 the token's field is visible.
+async function loadModel() {
+  const reply = await fetch("model", { headers: authorization() });
+  const answer = await reply.json();
+  if (reply.status === 401) $("locked").hidden = false;
+  if (!reply.ok) {
+    $("model").textContent = answer.detail;
+    return;
+  }
+  model = answer;
+  $("model").textContent =
+    `model ${model.model.slice(0, 12)}, ${model.engine} ${model.precision}, ` +
+    `camera ${model.camera.width} × ${model.camera.height}, ${model.camera.fov_y_deg}° vertical`;
+  const named = Object.keys(model.cameras ?? {}).map((name) => new Option(name, name));
+  $("camera").replaceChildren($("camera").firstElementChild, ...named);
+  $("cameras").hidden = !named.length;
+  await ask();
+}
 
 async function ask() {
   if (!current || asking) return;
+  if (!model) return refuse($("model").textContent, current.image);
   asking = true;
   const { body, image, truth } = current;
   const started = performance.now();
@@ -25,7 +44,7 @@ async function ask() {
     const headers = { "Content-Type": body.type };
     const named = $("camera").value;
     if (named) headers["X-Camera"] = named;
-    if ($("token").value) headers.Authorization = `Bearer ${$("token").value}`;
+    Object.assign(headers, authorization());
     const reply = await fetch("features", { method: "POST", headers, body });
     const answer = await reply.json();
     if (reply.status === 401) $("locked").hidden = false;
@@ -160,9 +179,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
     if (kind === "drop") takeFile(event.dataTransfer.files[0]);
   });
 }
-$("token").addEventListener("change", ask);
-for (const name of Object.keys(model.cameras ?? {})) $("camera").add(new Option(name, name));
-$("cameras").hidden = !Object.keys(model.cameras ?? {}).length;
+$("token").addEventListener("change", loadModel);
 $("camera").addEventListener("change", ask);
 setInterval(() => $("repeat").checked && ask(), EVERY_MS);
 
@@ -182,4 +199,5 @@ for (const { file, about, truth } of samples) {
   $("samples").append(button);
 }
 document.documentElement.dataset.ready = "yes";
+await loadModel();
 $("samples").firstElementChild?.click();

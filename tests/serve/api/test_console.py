@@ -208,3 +208,45 @@ def test_console_geometry_equals_the_projection_of_any_camera(tmp_path: Path) ->
             if pixel is not None:
                 assert pixel == pytest.approx(wanted, abs=1e-6)
     assert unseen >= 6
+
+
+PAGE = """
+const made = {}, listeners = {};
+const element = (id) => made[id] ??= {
+  style: {}, dataset: {}, hidden: true, value: "", children: [], classList: { toggle() {} },
+  addEventListener(event, action) { listeners[`${id} ${event}`] = action; },
+  append() {}, replaceChildren() {}, setAttribute() {}, dispatchEvent() {},
+  getContext: () => new Proxy({}, { get: () => () => {} }),
+};
+globalThis.document = {
+  getElementById: element, querySelector: element,
+  createElement: () => element(Math.random()), documentElement: { dataset: {} },
+};
+globalThis.location = { origin: "http://service" };
+globalThis.setInterval = () => {};
+const camera = { width: 280, height: 210, fov_y_deg: 67.5 };
+const card = { model: "ab".repeat(32), engine: "fake", precision: "f32", camera, cameras: {} };
+globalThis.fetch = async (path, options = {}) => {
+  if (path !== "model") return { status: 200, ok: true, json: async () => [] };
+  const ok = options.headers?.Authorization === "Bearer right";
+  return { status: ok ? 200 : 401, ok, json: async () => (ok ? card : { detail: "no token" }) };
+};
+await import(process.argv[2]);
+const shown = () => [element("locked").hidden, element("model").textContent];
+const before = shown();
+element("token").value = "right";
+await listeners["token change"]();
+console.log(JSON.stringify([before, shown()]));
+"""
+"""A script for node: the console on a fake page of a service with the token `right`."""
+
+
+@needs_node
+def test_the_page_of_a_service_with_a_token_asks_for_it(tmp_path: Path) -> None:
+    file = tmp_path / "page.mjs"
+    file.write_text(PAGE)
+    words = ["node", str(file), (FOLDER / "console.js").as_uri()]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    before, after = json.loads(done.stdout)
+    assert before == [False, "no token"]
+    assert after[1].startswith("model abababababab, fake f32, camera 280 ")
