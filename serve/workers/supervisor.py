@@ -70,7 +70,9 @@ class Supervisor:
         self._last_generation = 0  # number of the last reload, also if it failed
         self._change_lock = asyncio.Lock()
         self._stopping = asyncio.Event()
-        self._has_terminal = _has_terminal()
+        # Under `nohup`, which ignores SIGHUP, the service outlives its terminal.
+        nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        self._has_terminal = not nohup and _has_terminal()
 
     @property
     def folder(self) -> Path:

@@ -118,14 +118,30 @@ def test_a_stop_is_obeyed_while_the_model_is_loaded_and_a_reload_is_not_needed(
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "stops"), [(True, False, True), (True, True, False), (False, False, False)]
+    ("at_start", "before", "now", "stops"),
+    [
+        (signal.SIG_DFL, True, False, True),
+        (signal.SIG_DFL, True, True, False),
+        (signal.SIG_DFL, False, False, False),
+        (signal.SIG_IGN, True, False, False),
+    ],
 )
-def test_a_hangup_stops_a_service_whose_terminal_was_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: bool, now: bool, stops: bool
+def test_a_hangup_stops_a_service_whose_terminal_was_closed_but_not_under_nohup(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    at_start: signal.Handlers,
+    before: bool,
+    now: bool,
+    stops: bool,
 ) -> None:
+    """`at_start`: the action of SIGHUP when the service starts."""
     reloads: list[bool] = []
     monkeypatch.setattr(module, "_has_terminal", lambda: before)
-    supervisor = make_supervisor(tmp_path)
+    action = signal.signal(signal.SIGHUP, at_start)
+    try:
+        supervisor = make_supervisor(tmp_path)
+    finally:
+        signal.signal(signal.SIGHUP, action)
     monkeypatch.setattr(module, "_has_terminal", lambda: now)
     supervisor._on_hangup(lambda: reloads.append(True))
     assert (supervisor._stopping.is_set(), bool(reloads)) == (stops, not stops)
