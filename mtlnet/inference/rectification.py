@@ -33,7 +33,8 @@ BORDER_LEVEL = 128
 like the padding of convolutions."""
 TOLERANCE = 0.01
 OUTSIDE = -1e4  # outside every image, px
-KEPT_MAPS = 16
+KEPT_MAPS = 64  # at least the number of cameras of a service (`serve.cameras`); 0.35 MB each
+KEPT_SHARES = 1024
 
 Metres = NDArray[np.float64]
 
@@ -188,7 +189,7 @@ def _is_ahead(target: CameraParameters, way: Metres) -> bool:
     return bool((corners @ way[2] > 0).all())
 
 
-@lru_cache(maxsize=KEPT_MAPS)
+@lru_cache(maxsize=4)  # the two functions below keep what they compute from it
 def _maps(source: CameraParameters, target: CameraParameters) -> NDArray[np.float32]:
     """Return column and row (2, H, W), px, of the source's pixel for each pixel of the target;
     `OUTSIDE` where the source shows nothing."""
@@ -210,7 +211,7 @@ def _fixed_maps(
     return coarse.astype(np.int16, copy=False), fine.astype(np.uint16, copy=False)
 
 
-@lru_cache(maxsize=KEPT_MAPS)
+@lru_cache(maxsize=KEPT_SHARES)
 def shown_shares(source: CameraParameters, target: CameraParameters) -> tuple[float, float, float]:
     """Return three shares of the target's view: of its rows, of its columns, and of its rows below
     the horizon of a level road. A row or column counts if the source shows any part of it."""

@@ -123,9 +123,10 @@ class FrameQueue:
 
         `is_committed` is called at each frame.
         """
+        loaded = LoadedEngine.of(engine, cameras)  # slow with many cameras: before the lock
         with self._model_lock:
             self._promote_staged()
-            self._staged = StagedEngine(LoadedEngine.of(engine, cameras), is_committed)
+            self._staged = StagedEngine(loaded, is_committed)
 
     def drop_staged_model(self) -> None:
         """Discard the staged engine, unless its `is_committed()` already returns True."""

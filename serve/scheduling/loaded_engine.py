@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import trackfeatures as tf
 from mtlnet.inference.engine import Engine
-from mtlnet.inference.rectification import Rectification
+from mtlnet.inference.rectification import Rectification, shown_shares
 from serve.cameras import Cameras
 from trackfeatures.camera import CameraParameters
 
@@ -35,6 +35,9 @@ class LoadedEngine:
             "engine": engine.kind,
             "precision": engine.precision,
         }
+        # Computed and kept here, because a frame's size is checked in the event loop.
+        for camera in cameras.values():
+            shown_shares(camera, engine.card.camera)
         return cls(engine, provenance, cameras, engine.card.camera)
 
 

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mtlnet.inference import rectification
 from mtlnet.inference.prediction import decode_outputs
-from mtlnet.inference.rectification import Rectification
+from mtlnet.inference.rectification import Rectification, shown_shares
 from runtime.camera_file import write_camera
-from serve.cameras import read_cameras
+from serve.cameras import MAX_CAMERAS, read_cameras
 from serve.client import Client, ServiceError
 from serve.config import Limits
+from serve.scheduling.loaded_engine import LoadedEngine
 from serve.workers.worker_process import WorkerTask
 from tests.serve.api.test_options import WIDE, features, infer, post, stream
 from tests.serve.conftest import (
@@ -157,3 +159,17 @@ def test_cameras_are_read_at_the_start(tmp_path: Path) -> None:
     for options, message in faults:
         with pytest.raises(UserError, match=message):
             read_cameras(options, MODEL)
+
+
+def test_the_maps_of_all_cameras_are_kept_and_their_checks_precede_the_first_frame(
+    engine: FakeEngine,
+) -> None:
+    """A check that is not kept blocks the event loop for about 75 ms."""
+    cameras = {str(k): replace(MODEL, z=0.8 + 0.01 * k) for k in range(20)}
+    shown_shares.cache_clear()
+    loaded = LoadedEngine.of(engine, cameras)
+    assert shown_shares.cache_info().misses == len(cameras)
+    for name in cameras:
+        loaded.rectification(name).check(MODEL.width, MODEL.height)
+    assert shown_shares.cache_info().misses == len(cameras)
+    assert rectification.KEPT_MAPS >= MAX_CAMERAS
