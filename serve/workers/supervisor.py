@@ -11,7 +11,7 @@ import os
 import signal
 import socket
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ class Supervisor:
         for listener in self._listeners:
             listener.listen(BACKLOG)
         for position in range(self._plan.workers):
-            self._workers[position] = await self._start_worker(self._free_block())
+            self._workers[position] = await start_worker(self._task(self._free_block()))
         loading = asyncio.gather(
             *(worker.wait_loaded(0, LOAD_TIMEOUT_S) for worker in self._workers.values())
         )
@@ -160,9 +160,9 @@ class Supervisor:
                 cameras = self._plan.cameras(folder)
             except UserError as error:
                 raise UserError(f"{error}; the old model stays in use") from error
-            workers = [worker for worker in self._workers.values() if worker.alive]
+            workers = await self._loaded_workers()
             if not workers:
-                raise UserError("no worker is alive; workers are being restarted, try again")
+                return await self._start_anew(name, folder, cameras)
             # Each reload has a new number, so that a late report of a failed reload is not taken
             # for a report of the next reload.
             self._last_generation += 1
@@ -187,6 +187,34 @@ class Supervisor:
             logger.info("now serving %s, model %s", folder, model_hash[:12])
             return model_hash
 
+    async def _loaded_workers(self) -> list[WorkerProcess]:
+        """Return the living workers once they have loaded the model. A worker that cannot load it
+        is stopped."""
+        for worker in list(self._workers.values()):
+            try:
+                await worker.wait_loaded(worker.task.generation, LOAD_TIMEOUT_S)
+            except UserError:  # `_replace_dead` logs it
+                await worker.stop(STOP_TIMEOUT_S)
+        return [worker for worker in self._workers.values() if worker.alive]
+
+    async def _start_anew(
+        self, name: str, folder: Path, cameras: Mapping[str, CameraParameters]
+    ) -> str:
+        """Serve the model in `folder` with one new worker, because no worker is alive;
+        `_replace_dead` starts the others. Returns the hash of the weights. Raises UserError; the
+        workers are then started with the old model."""
+        position, dead = next(iter(self._workers.items()))
+        task = self._task(self._free_block(without=dead))
+        new, model_hash = await _start_ready(
+            replace(task, folder=str(folder.resolve()), expected=None, cameras=cameras)
+        )
+        self._workers[position] = new
+        self._folder, self._model, self._model_hash = folder, name, model_hash
+        self._cameras = cameras
+        await dead.stop(STOP_TIMEOUT_S)  # closes the socket to it
+        logger.info("now serving %s, model %s", folder, model_hash[:12])
+        return model_hash
+
     def _on_hangup(self, reload: Callable[[], None]) -> None:
         """Reload on SIGHUP; stop if the reason of SIGHUP is that the terminal was closed."""
         if self._has_terminal and not _has_terminal():
@@ -202,13 +230,7 @@ class Supervisor:
         """
         async with self._change_lock:
             for position, old in list(self._workers.items()):
-                new = await self._start_worker(self._free_block())
-                try:
-                    await new.wait_loaded(self._head[COMMITTED_GENERATION], LOAD_TIMEOUT_S)
-                    await new.wait_ready(LOAD_TIMEOUT_S)
-                except BaseException:  # also if the service is stopped
-                    await new.stop(STOP_TIMEOUT_S)
-                    raise
+                new, _ = await _start_ready(self._task(self._free_block()))
                 self._workers[position] = new
                 await old.stop(STOP_TIMEOUT_S)
 
@@ -231,14 +253,14 @@ class Supervisor:
                     continue
                 block = self._free_block(without=worker)
                 try:
-                    self._workers[position] = await self._start_worker(block)
+                    self._workers[position] = await start_worker(self._task(block))
                 except OSError as error:  # no processes or memory left; tried again
                     logger.error("cannot start a worker: %s", error)
                 else:
                     await worker.stop(STOP_TIMEOUT_S)  # closes the socket to it
 
-    async def _start_worker(self, block: int) -> WorkerProcess:
-        task = WorkerTask(
+    def _task(self, block: int) -> WorkerTask:
+        return WorkerTask(
             folder=str(self._folder.resolve()),
             generation=self._head[COMMITTED_GENERATION],
             expected=self._model_hash,
@@ -250,11 +272,23 @@ class Supervisor:
             cameras=self._cameras,
             views=self._plan.views,
         )
-        return await start_worker(task)
 
     def _free_block(self, without: WorkerProcess | None = None) -> int:
         used = {w.task.block for w in self._workers.values() if w is not without}
         return min(set(range(self._shared.blocks)) - used)
+
+
+async def _start_ready(task: WorkerTask) -> tuple[WorkerProcess, str]:
+    """Start a worker and wait until it can answer images; return it and the hash of its weights.
+    Raises UserError if it does not become ready; it is then stopped."""
+    worker = await start_worker(task)
+    try:
+        report = await worker.wait_loaded(task.generation, LOAD_TIMEOUT_S)
+        await worker.wait_ready(LOAD_TIMEOUT_S)
+    except BaseException:  # also if the service is stopped
+        await worker.stop(STOP_TIMEOUT_S)
+        raise
+    return worker, str(report["model"])
 
 
 def _load_problem(reports: list[Any]) -> str | None:

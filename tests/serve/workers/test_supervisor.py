@@ -1,100 +1,19 @@
 """Reload and restart with failing workers; the workers are fakes that load no model."""
 
 import asyncio
-import json
 import signal
-import socket
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from runtime.sockets import bind
 from serve.config import Limits
-from serve.shared_memory import BODY_BYTES
 from serve.workers import supervisor as module
 from serve.workers.supervisor import ServicePlan, Supervisor
-from serve.workers.worker_process import WorkerProcess, WorkerTask
 from tests.serve.conftest import PATIENCE_S
+from tests.serve.workers.conftest import FakeWorkers, make_supervisor, until_started
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
-
-
-class FakeProcess:
-    """A fake worker process, which runs until it is terminated."""
-
-    def __init__(self) -> None:
-        self.pid = 1
-        self.returncode: int | None = None
-        self._ended = asyncio.Event()
-
-    async def wait(self) -> int:
-        await self._ended.wait()
-        return 0
-
-    def terminate(self) -> None:
-        self.returncode = 0
-        self._ended.set()
-
-
-class FakeWorkers:
-    """Starts fake workers. They become ready if `is_ready`; loading `failing_folders` fails."""
-
-    def __init__(self) -> None:
-        self.started: list[WorkerProcess] = []
-        self.failing_folders: set[str] = set()
-        self.cameras: list[Any] = []
-        """The cameras in the messages for a reload."""
-        self.is_ready = True
-        self.is_loading = False
-        """Whether the workers never finish loading."""
-        self._tasks: set[asyncio.Task[None]] = set()
-
-    async def start(self, task: WorkerTask) -> WorkerProcess:
-        ours, theirs = socket.socketpair()
-        reader, writer = await asyncio.open_connection(sock=ours)
-        process: Any = FakeProcess()
-        worker = WorkerProcess(task, process, reader, writer)
-        self.started.append(worker)
-        run = asyncio.ensure_future(self._run(task, theirs))
-        self._tasks.add(run)
-        if not self.is_loading:
-            await worker.wait_loaded(task.generation, PATIENCE_S)
-        return worker
-
-    async def _run(self, task: WorkerTask, connection: socket.socket) -> None:
-        reader, writer = await asyncio.open_connection(sock=connection)
-
-        def send(**message: object) -> None:
-            writer.write(json.dumps(message).encode() + b"\n")
-
-        if self.is_loading:
-            await reader.read()  # until the supervisor closes the socket
-            return
-        send(loaded=task.generation, model="a" * 64, engine="fake", precision="f32")
-        if self.is_ready:
-            send(ready=True)
-        async for line in reader:
-            message = json.loads(line)
-            if "load" not in message:
-                continue
-            self.cameras.append(message["cameras"])
-            if message["load"] in self.failing_folders:
-                send(failed=message["generation"], why="the weights are damaged")
-            else:
-                send(loaded=message["generation"], model="b" * 64, engine="fake", precision="f32")
-
-
-@pytest.fixture
-def workers(monkeypatch: pytest.MonkeyPatch) -> FakeWorkers:
-    found = FakeWorkers()
-    monkeypatch.setattr(module, "start_worker", found.start)
-    return found
-
-
-def make_supervisor(folder: Path) -> Supervisor:
-    plan = ServicePlan("run", lambda name: folder / name, 2, Limits())
-    return Supervisor(plan, [bind("127.0.0.1", 0)])
 
 
 def test_a_stop_is_obeyed_while_the_model_is_loaded_and_a_reload_is_not_needed(
@@ -228,64 +147,6 @@ def test_a_worker_that_failed_a_reload_and_died_later_reports_how_it_died(
         return workers.started[0].exit_reason()
 
     assert asyncio.run(scenario()) == "exit code 0"
-
-
-async def until_started(workers: FakeWorkers, count: int) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while len(workers.started) < count:
-            await asyncio.sleep(0.01)
-
-
-def test_a_killed_worker_leaves_no_bodies_in_the_budget(
-    workers: FakeWorkers, tmp_path: Path
-) -> None:
-    """The replacement of a killed worker can use another block of the shared memory."""
-
-    async def scenario() -> None:
-        supervisor = make_supervisor(tmp_path)
-        await supervisor.start()
-        running = asyncio.ensure_future(supervisor.run())
-        await supervisor.restart()
-        killed = max(workers.started[2:], key=lambda worker: worker.task.block)
-        cells = supervisor._shared.worker(killed.task.block)
-        cells[BODY_BYTES] = 60e6
-        killed._process.terminate()
-        await until_started(workers, 5)
-        assert workers.started[-1].task.block != killed.task.block
-        assert cells[BODY_BYTES] == 0.0
-        supervisor._stopping.set()
-        await running
-
-    asyncio.run(scenario())
-
-
-def test_a_worker_that_cannot_be_started_is_tried_again(
-    workers: FakeWorkers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "MIN_BACKOFF_S", 0.01)
-    failures: list[OSError] = []
-
-    async def fail_twice(task: WorkerTask) -> WorkerProcess:
-        if len(failures) < 2:
-            failures.append(BlockingIOError("Resource temporarily unavailable"))
-            raise failures[-1]
-        return await workers.start(task)
-
-    async def scenario() -> None:
-        supervisor = make_supervisor(tmp_path)
-        await supervisor.start()
-        monkeypatch.setattr(module, "start_worker", fail_twice)
-        running = asyncio.ensure_future(supervisor.run())
-        await asyncio.sleep(0)
-        dead = workers.started[0]
-        dead._process.terminate()
-        await until_started(workers, 3)
-        supervisor._stopping.set()
-        await running
-        assert dead._writer.is_closing()
-
-    asyncio.run(scenario())
-    assert len(failures) == 2
 
 
 def test_a_replacement_that_ends_is_reported_with_its_end(
