@@ -17,6 +17,8 @@ from typing import Any
 from trackfeatures.errors import UserError
 
 ANSWER_TIMEOUT_S = 180.0
+RUNTIME_FOLDERS = Path("/run/user")
+"""Folder in which systemd creates the XDG_RUNTIME_DIR of each user, named by the user's number."""
 
 logger = logging.getLogger(__name__)
 
@@ -24,10 +26,18 @@ Command = Callable[[str | None], Awaitable[str]]
 
 
 def socket_path(port: int) -> Path:
-    """Return the path of the control socket of the service on `port`."""
+    """Return the path of the control socket of a service on `port` that has our environment."""
+    return _possible_paths(port)[0]
+
+
+def _possible_paths(port: int) -> list[Path]:
+    """Return all paths that the control socket of the service on `port` can have. systemd and cron
+    set no XDG_RUNTIME_DIR, so that the environment of the service can differ from ours."""
+    user = str(os.getuid())
     base = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(base) if base else Path(tempfile.gettempdir()) / f"driverview-{os.getuid()}"
-    return folder / f"driverview-serve-{port}.sock"
+    folders = [Path(base)] if base else []
+    folders += [Path(tempfile.gettempdir()) / f"driverview-{user}", RUNTIME_FOLDERS / user]
+    return [folder / f"driverview-serve-{port}.sock" for folder in dict.fromkeys(folders)]
 
 
 def send_command(port: int, command: str, model: str | None = None) -> str:
@@ -37,7 +47,8 @@ def send_command(port: int, command: str, model: str | None = None) -> str:
     Raises UserError if no service of this user is found, if it does not answer in time, or if it
     answers with an error.
     """
-    path = socket_path(port)
+    paths = _possible_paths(port)
+    path = next((found for found in paths if _accepts(found)), paths[0])
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(ANSWER_TIMEOUT_S)
         try:
@@ -52,8 +63,8 @@ def send_command(port: int, command: str, model: str | None = None) -> str:
             ) from None
         except OSError:
             raise UserError(
-                f"found no service of yours on port {port} (no socket {path}); give its --port, "
-                "or send SIGHUP to its process"
+                f"found no service of yours on port {port} (no socket "
+                f"{' or '.join(map(str, paths))}); give its --port, or send SIGHUP to its process"
             ) from None
     if not line:
         raise UserError("the service stopped before it answered; see its log")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from serve.workers import control_socket as module
 from serve.workers.control_socket import listen_for_commands, send_command
 from trackfeatures.errors import UserError
 
@@ -75,3 +76,35 @@ def test_two_services_with_one_port_do_not_take_each_others_commands(
 
     asyncio.run(scenario())
     assert "another service on port 8000" in caplog.text
+
+
+@pytest.mark.parametrize("has_login", [False, True])
+def test_a_service_that_was_started_in_another_environment_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_login: bool
+) -> None:
+    """systemd and cron set no XDG_RUNTIME_DIR, a login does. `has_login`: whether the service is
+    started in a login and the command is not."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(module, "RUNTIME_FOLDERS", tmp_path)
+    login = tmp_path / str(os.getuid())
+    for folder in (tmp_path / "tmp", login):
+        folder.mkdir()
+
+    def enter(runtime: Path | None) -> None:
+        if runtime is None:
+            monkeypatch.delenv("XDG_RUNTIME_DIR")
+        else:
+            monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+
+    async def answer(_model: str | None) -> str:
+        return "done"
+
+    async def scenario() -> str:
+        enter(login if has_login else None)
+        server = await listen_for_commands(PORT, {"reload": answer})
+        assert server is not None
+        enter(None if has_login else login)
+        async with server:
+            return await asyncio.to_thread(send_command, PORT, "reload")
+
+    assert asyncio.run(scenario()) == "done"
