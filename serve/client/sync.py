@@ -79,7 +79,9 @@ class Client:
         self.url = parts.geturl().rstrip("/")
         self._path = parts.path.rstrip("/")
         kind = http.client.HTTPSConnection if parts.scheme == "https" else _plain_connection
-        self._connection = kind(_host(parts), parts.port, timeout=timeout_s)
+        # Without a port http.client would take the last group of an IPv6 address for the port.
+        default = http.client.HTTPS_PORT if parts.scheme == "https" else http.client.HTTP_PORT
+        self._connection = kind(_host(parts), parts.port or default, timeout=timeout_s)
         # Tries IPv4 and IPv6 for "localhost" within the timeout; /etc/hosts can lack one of them.
         self._connection._create_connection = connect  # type: ignore[attr-defined]
         self._timeout_s = timeout_s
@@ -241,7 +243,7 @@ class Client:
             raise
 
 
-def _plain_connection(host: str, port: int | None, *, timeout: float) -> http.client.HTTPConnection:
+def _plain_connection(host: str, port: int, *, timeout: float) -> http.client.HTTPConnection:
     return http.client.HTTPConnection(host, port, timeout=timeout)
 
 

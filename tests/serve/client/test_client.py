@@ -282,6 +282,22 @@ def test_invalid_addresses(url: str) -> None:
         Client(url)
 
 
+@pytest.mark.parametrize(
+    ("url", "host", "port"),
+    [
+        ("http://[::1]", "::1", 80),
+        ("https://[2001:db8::abcd]", "2001:db8::abcd", 443),
+        ("http://[fe80::1%25eth0]", "fe80::1%eth0", 80),
+        ("http://host", "host", 80),
+    ],
+)
+def test_an_address_without_a_port_has_the_port_of_its_scheme(
+    url: str, host: str, port: int
+) -> None:
+    connection = Client(url)._connection
+    assert (connection.host, connection.port) == (host, port)
+
+
 @pytest.mark.parametrize("listens", ["127.0.0.1", "::1"])
 def test_localhost_is_both_loopback_addresses(listens: str) -> None:
     with serving(host=listens) as service:
