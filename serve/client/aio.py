@@ -45,12 +45,14 @@ class AsyncClient:
         the service's token; the default is $DRIVERVIEW_TOKEN, if it is set. Raises ServiceError if
         `url` or `token` is not valid."""
         self._client = Client(url, timeout_s, token)
+        self.url = self._client.url
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="driverview-client")
         self._closed = False
 
     features = _in_thread(Client.features)
     model = _in_thread(Client.model)
     ready = _in_thread(Client.ready)
+    wait_until_ready = _in_thread(Client.wait_until_ready)
     _close = _in_thread(Client.close)
 
     async def close(self) -> None:

@@ -142,6 +142,17 @@ def test_asyncio_clients_ask_concurrently(service: Served) -> None:
     assert [answer["frame_id"] for answer in answers] == ["0", "1", "2", "3"]
 
 
+def test_the_asyncio_client_has_every_method_of_the_client(service: Served) -> None:
+    assert {name for name in dir(Client) if not name.startswith("_")} <= set(dir(AsyncClient))
+
+    async def wait() -> str:
+        async with AsyncClient(f"{service.url}/") as client:
+            await client.wait_until_ready()
+            return client.url
+
+    assert asyncio.run(wait()) == service.url
+
+
 def test_an_asyncio_client_may_be_closed_twice(service: Served) -> None:
     async def close_early() -> None:
         async with AsyncClient(service.url) as client:
