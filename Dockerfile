@@ -2,7 +2,7 @@
 #
 #   docker build --target serve|train|collect -t driverview-TARGET:0.2.0 .
 #   docker run -p 8000:8000 -e DRIVERVIEW_TOKEN -v "$PWD/runs:/driverview/runs:ro" \
-#     driverview-serve:0.2.0
+#     driverview-serve:0.2.0 serve --model latest --host 0.0.0.0
 #   docker run -v "$PWD/datasets:/driverview/datasets" \
 #     driverview-collect:0.2.0 datagen collect --rounds 60
 #   docker run --gpus all -v "$PWD/datasets:/driverview/datasets:ro" -v "$PWD/runs:/driverview/runs" \

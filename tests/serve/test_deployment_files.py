@@ -193,3 +193,12 @@ def test_the_lock_holds_every_dependency_of_every_package_in_it() -> None:
         ]
     assert len(locked) > 100
     assert not missing
+
+
+def test_an_example_that_mounts_runs_serves_one_of_them() -> None:
+    """Without `--model` the container serves the shipped model."""
+    examples = re.findall(r"docker run(?:.*\\\n)*.*", DOCKERFILE)
+    serving = [example for example in examples if "driverview-serve" in example]
+    assert serving
+    for example in serving:
+        assert "/driverview/runs" not in example or " serve --model " in example
