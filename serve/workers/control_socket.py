@@ -48,7 +48,7 @@ def send_command(port: int, command: str, model: str | None = None) -> str:
     answers with an error.
     """
     paths = _possible_paths(port)
-    path = next((found for found in paths if _accepts(found)), paths[0])
+    path = next((p for p in paths if _is_ours(p.parent) and _accepts(p)), paths[0])
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(ANSWER_TIMEOUT_S)
         try:
@@ -124,7 +124,15 @@ def _accepts(path: Path) -> bool:
     return True
 
 
+def _is_ours(folder: Path) -> bool:
+    """Whether this user owns the folder; anyone can create its known name."""
+    try:
+        return folder.stat().st_uid == os.getuid()
+    except OSError:
+        return False
+
+
 def _check_owner(folder: Path) -> None:
-    """Raise PermissionError if another user owns the folder; anyone can create its known name."""
+    """Raise PermissionError if another user owns the folder, OSError if there is none."""
     if folder.stat().st_uid != os.getuid():
         raise PermissionError(f"{folder} belongs to another user")

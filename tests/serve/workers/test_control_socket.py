@@ -108,3 +108,31 @@ def test_a_service_that_was_started_in_another_environment_is_found(
             return await asyncio.to_thread(send_command, PORT, "reload")
 
     assert asyncio.run(scenario()) == "done"
+
+
+def test_a_socket_in_the_folder_of_another_user_does_not_hide_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    foreign, ours = tmp_path / "foreign", tmp_path / "tmp" / f"driverview-{os.getuid()}"
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(module, "_is_ours", lambda folder: folder != foreign)
+    for folder in (foreign, ours):
+        folder.mkdir(parents=True, mode=0o700)
+
+    async def answer_as(name: str) -> asyncio.Server:
+        async def answer(_model: str | None) -> str:
+            return name
+
+        server = await listen_for_commands(PORT, {"reload": answer})
+        assert server is not None
+        return server
+
+    async def scenario() -> str:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(foreign))
+        theirs = await answer_as("theirs")
+        monkeypatch.delenv("XDG_RUNTIME_DIR")
+        async with theirs, await answer_as("ours"):
+            monkeypatch.setenv("XDG_RUNTIME_DIR", str(foreign))
+            return await asyncio.to_thread(send_command, PORT, "reload")
+
+    assert asyncio.run(scenario()) == "ours"
