@@ -13,7 +13,7 @@ from trackfeatures.errors import UserError
 @dataclass(frozen=True, slots=True)
 class DemoConfig:
     """The numbers of rounds and frames that the demo collects, and the time that it trains. With
-    the defaults the demo takes 17 minutes on two cores."""
+    the defaults the demo takes about 20 minutes on two cores."""
 
     out: Annotated[Path, "Folder to write all results to."] = Path("demo")
     rounds: Annotated[
