@@ -59,11 +59,12 @@ class DriveConfig:
     start_d: Annotated[
         float | None,
         "Start of the car, m to the left of the track's centre (negative: to the right). "
-        "Default: the centre of --target-lane, or 0 without --target-lane.",
+        "Default: the centre of the lane to follow.",
     ] = None
     target_lane: Annotated[
         int | None,
-        "Number of the lane to follow; 0 is the leftmost. Default: the lane nearest to the start.",
+        "Number of the lane to follow; 0 is the leftmost. Default: the lane nearest to --start-d, "
+        "or without --start-d the middle lane (of two lanes the right one).",
     ] = None
     throttle: Annotated[
         float | None,

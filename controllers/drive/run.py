@@ -301,10 +301,11 @@ def choose_lane(config: DriveConfig, road: Road) -> Lane:
         )
     if config.start_d is not None:
         start = config.start_d
-    elif target is not None:
-        start = tf.lane_centre(target, road.lanes, road.lane_width)
     else:
-        start = 0.0
+        # The track's centre is between two lanes; `lane_index` then selects the right one.
+        middle = tf.lane_index(0.0, road.lanes, road.lane_width)
+        lane = middle if target is None else target
+        start = tf.lane_centre(lane, road.lanes, road.lane_width)
     if not (math.isfinite(start) and abs(start) <= road.edge):
         raise UserError(
             f"start-d {start:g} m is off the road, which ends {road.edge:.2f} m from its centre"

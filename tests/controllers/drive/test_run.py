@@ -262,6 +262,12 @@ def test_choice_of_the_lane_to_follow() -> None:
     assert (single.start_d, single.centre) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize(("lanes", "start"), [(1, 0.0), (2, -2.0), (3, 0.0)])
+def test_a_drive_starts_at_the_centre_of_the_lane_that_it_follows(lanes: int, start: float) -> None:
+    lane = choose_lane(DriveConfig(lanes=lanes), Road(find_track("oval"), lanes=lanes))
+    assert (lane.start_d, lane.centre) == (start, start)
+
+
 def test_the_result_is_written_as_json() -> None:
     result = run_lap(
         FakeWorld(at_rest()), FunctionController(lambda observation: 0.0), perceiving(), 1
