@@ -1,6 +1,7 @@
 """The episodes of one car. Its random generator determines road, car and start of each episode."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from simulator.env.options import DriveOptions, draw, ends_of
 from simulator.env.start import check_start
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
+from simulator.track.random_roads.kinds import least_width_m
 from simulator.track.random_roads.road import RANDOM, random_name
 from simulator.track.road import Road
 from simulator.varied.road import make_road
@@ -57,7 +59,7 @@ class Drive:
         self._draws_car = any(
             isinstance(value, tuple) for value in (options.friction, options.mass)
         )
-        self._narrowest = None if options.track == RANDOM else self._narrowest_road()
+        self._narrowest = self._narrowest_road()
         self.world = self._make_world(None)
 
     def reset(self, rng: np.random.Generator, given: Mapping[str, Any]) -> int:
@@ -75,15 +77,13 @@ class Drive:
         """Return the start of an episode: the start in the car's own options, overridden by the
         options `given` to `reset` that are not None. Ranges stay ranges. Raises UserError for an
         unknown option, a value that is not a number, or a start off the narrowest road that the
-        options allow. The last check is left out if the track is random."""
+        options allow."""
         own = {name: value for name, value in given.items() if value is not None}
         start = {**self._options.start, **own}
         ranges = {name: ends_of(name, value) for name, value in start.items() if _is_range(value)}
         for end in (0, 1):
             values = {name: ranges[name][end] if name in ranges else start[name] for name in start}
-            place = check_start(values, self._narrowest or self.world.road)
-            if self._narrowest is not None:
-                check_place(self._narrowest, **place)
+            check_place(self._narrowest, **check_start(values, self._narrowest))
         return start
 
     def _make_world(self, rng: np.random.Generator | None) -> World:
@@ -111,13 +111,17 @@ class Drive:
         return self._roads.road(options, track, lanes, self._draw_width(rng))
 
     def _narrowest_road(self) -> Road:
+        """Return the narrowest road that the options allow. For `track="random"` it is the first
+        random road with the least width of a random road."""
         options, lanes = self._options, self._options.lanes
         least, greatest = lanes if isinstance(lanes, tuple) else (lanes, lanes)
-        width = self._draw_width(None)
-        roads = (
-            self._roads.road(options, options.track, count, width)
-            for count in range(least, greatest + 1)
-        )
+        random = options.track == RANDOM
+        track, width = random_name(0) if random else options.track, self._draw_width(None)
+        counts = range(least, greatest + 1)
+        roads = [self._roads.road(options, track, count, width) for count in counts]
+        if random:
+            narrow = replace(roads[0].track, width=least_width_m())
+            roads = [replace(road, track=narrow) for road in roads]
         return min(roads, key=lambda road: road.edge)
 
     def _draw_width(self, rng: np.random.Generator | None) -> float | None:

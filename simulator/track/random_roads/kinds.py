@@ -69,6 +69,11 @@ def _kind(name: str, row: dict[str, Any]) -> Kind:
     return Kind(name=name, **fields)
 
 
+def least_width_m() -> float:
+    """Return the least width (m) of a random road of any kind."""
+    return min(kind.width_m[0] for kind in kinds())
+
+
 def kind_of(seed: int) -> Kind:
     """Return the kind of the road of `seed`."""
     block, place = divmod(seed, BLOCK)

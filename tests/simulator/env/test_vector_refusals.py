@@ -131,3 +131,31 @@ def test_a_start_that_does_not_fit_on_all_random_lanes_is_refused_at_the_first_r
             env.reset(seed=seed)
     vector.close()
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ({"to_middle": (-4.0, 4.0)}, "reset got to_middle = -4.0 m; the road ends 3.50 m"),
+        ({"speed": (100.0, 200.0)}, "reset got speed = 200.0; give m/s between"),
+    ],
+)
+def test_a_start_that_does_not_fit_on_all_random_roads_is_refused_at_the_first_reset(
+    start: dict[str, Any], message: str
+) -> None:
+    vector = make_vector(2, track="random", start=start)
+    with pytest.raises(UserError, match=f"^car 0: {message}"):
+        vector.reset(seed=0)
+    env = gym.make(ID, track="random", start=start)
+    for seed in range(4):
+        with pytest.raises(UserError, match=message):
+            env.reset(seed=seed)
+    vector.close()
+    env.close()
+
+
+def test_a_start_on_the_edge_of_the_narrowest_random_road_fits_on_all_random_roads() -> None:
+    env = gym.make(ID, track="random", start={"to_middle": 3.5})
+    for seed in range(8):
+        assert env.reset(seed=seed)[1]["to_middle"] == pytest.approx(3.5)
+    env.close()
