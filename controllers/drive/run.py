@@ -108,11 +108,11 @@ def drive(
         scene: dict[str, Any] = {"light": config.light, "seed": config.seed}
         scene |= {"model": config.model, "views": config.views, "lane_centre": lane.centre}
         source = stack.enter_context(open_perception(config.perception, world, **scene))
-        watching = [*observers, *_observers(config, stack, world, source, lane)]
         live = _real_time(config, source, disturbance) if config.realtime else None
         if live is not None:
             stack.enter_context(live)
         perceive = LastAnswer(live or delay(config, source, disturbance.delay_s))
+        watching = [*observers, *_observers(config, stack, world, source, lane)]
         result = run_lap(
             world,
             disturbance.controller(controller, config.seed),
@@ -245,9 +245,6 @@ def _observers(
     config: DriveConfig, stack: ExitStack, world: World, perceive: Perceive, lane: Lane
 ) -> Iterator[Observer]:
     """Yield the observers that `config` names: log, film and live page. `stack` closes them."""
-    if config.log is not None:
-        log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
-        yield lambda now, perceived, steer: log.write(now, steer)
     if config.video is not None:
         from controllers.drive.film import DriveFilm
         from simulator.camera import open_camera
@@ -267,6 +264,9 @@ def _observers(
 
         show = stack.enter_context(watch(config, world, lane.centre))
         yield lambda now, perceived, steer: show(perceived)
+    if config.log is not None:  # last: an error above leaves the log of an earlier drive as it is
+        log = DriveLog(stack.enter_context(config.log.open("w", encoding="utf-8")))
+        yield lambda now, perceived, steer: log.write(now, steer)
 
 
 def _recorder(

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.traffic.traffic import Traffic
 from simulator.vehicle.state import Command
+from simulator.watch import Watcher
 from simulator.world.world import World
 from tests.controllers.fake_world import FakeWorld, at_rest
 from trackfeatures import RoadClass, UserError
@@ -177,6 +179,35 @@ def test_the_default_controller_on_the_true_state_stays_in_the_middle(tmp_path: 
     again = drive(replace(config, log=tmp_path / "again.csv"))
     assert again == result
     assert (tmp_path / "again.csv").read_bytes() == log.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"drop": 1.5},
+        {"latency_ms": 5000.0},
+        {"realtime": True, "latency_ms": 50.0},
+        {"realtime": True, "drop": 1.5},
+    ],
+)
+def test_a_wrong_option_leaves_the_log_of_an_earlier_drive(
+    tmp_path: Path, wrong: dict[str, Any]
+) -> None:
+    log = tmp_path / "drive.csv"
+    log.write_text("an earlier drive\n")
+    with pytest.raises(UserError):
+        drive(replace(DriveConfig(steps=3), log=log, **wrong))
+    assert log.read_text() == "an earlier drive\n"
+
+
+def test_a_port_in_use_leaves_the_log_of_an_earlier_drive(tmp_path: Path) -> None:
+    log = tmp_path / "drive.csv"
+    log.write_text("an earlier drive\n")
+    with Watcher(port=0) as watcher:
+        port = int(watcher.url.rsplit(":", 1)[1])
+        with pytest.raises(UserError, match=f"port {port}"):
+            drive(DriveConfig(steps=3, log=log, watch=port))
+    assert log.read_text() == "an earlier drive\n"
 
 
 def test_two_lanes_follow_the_target_lane_among_traffic() -> None:
