@@ -2,8 +2,9 @@
 
 The first candidate is the controller's own parameters. The candidates of the first third of the
 budget are log-uniformly random over the whole ranges. All later candidates are random around the
-best candidate so far, at distances that shrink in proportion to the remaining budget. The file
-`config.out` is written after each candidate, so the same command continues an interrupted search.
+best random candidate so far, at distances that shrink in proportion to the remaining budget. The
+result is the best of all candidates. The file `config.out` is written after each candidate, so the
+same command continues an interrupted search.
 """
 
 import json
@@ -103,12 +104,13 @@ def propose(
     """
     if not tried:
         return {}
-    best = max(tried, key=lambda one: float(one["reward"]))["parameters"]
-    if len(tried) <= EXPLORED * budget or not best:
+    drawn = tried[1:]  # the first candidate, {}, has no values
+    if len(tried) <= EXPLORED * budget or not drawn:
         return {
             name: math.exp(rng.uniform(math.log(low), math.log(high)))
             for name, (low, high) in ranges.items()
         }
+    best = max(drawn, key=lambda one: float(one["reward"]))["parameters"]
     left = 1.0 - len(tried) / budget
     found = {}
     for name, (low, high) in ranges.items():

@@ -103,6 +103,31 @@ def test_candidates_stay_within_their_ranges() -> None:
     assert tried[-1]["parameters"]["a"] > 5.0  # near the best, at the end
 
 
+def search(budget: int, reward_of_the_defaults: float) -> list[dict[str, Any]]:
+    """Return the sets that are tried for a parameter whose best value is 1, with the reward -1."""
+    tried: list[dict[str, Any]] = []
+    for number in range(budget):
+        rng = np.random.default_rng([0, number])
+        parameters = propose({"a": (1e-3, 1e3)}, tried, budget, rng)
+        reward = -1.0 - abs(math.log(parameters["a"])) if parameters else reward_of_the_defaults
+        tried.append({"parameters": parameters, "reward": reward})
+    return tried
+
+
+def test_the_search_narrows_while_the_default_parameters_are_the_best() -> None:
+    tried = search(60, reward_of_the_defaults=0.0)
+    assert all(abs(math.log(one["parameters"]["a"])) < 1.5 for one in tried[-5:])
+    others = search(60, reward_of_the_defaults=-50.0)
+    assert [one["parameters"] for one in tried] == [one["parameters"] for one in others]
+
+
+@pytest.mark.parametrize("budget", [1, 2, 3])
+def test_a_small_budget_begins_with_the_default_parameters(budget: int) -> None:
+    first, *others = search(budget, reward_of_the_defaults=0.0)
+    assert first["parameters"] == {}
+    assert all(1e-3 <= one["parameters"]["a"] <= 1e3 for one in others)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
