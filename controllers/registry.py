@@ -245,6 +245,9 @@ def _load_file(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"{OWN_FILE}{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
+    folder = str(path.parent.resolve())
+    if folder not in sys.path:  # last, so that files in the folder hide no other module
+        sys.path.append(folder)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look up postponed annotations there
     try:

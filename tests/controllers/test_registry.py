@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,6 +138,20 @@ def test_a_users_file_may_hold_a_dataclass_with_postponed_annotations(own: Path,
     (own / f"{name}.py").write_text(OWN_DATACLASS)
     assert make_controller(f"{name}.py:Law", LOOP).update(SEEN) == pytest.approx(-0.02)
     assert importlib.import_module("json").loads("1") == 1
+
+
+def test_a_users_file_may_import_a_module_beside_it(own: Path) -> None:
+    folder = own / "laws"
+    folder.mkdir()
+    (folder / "gain_beside.py").write_text("GAIN = 0.5\n")
+    (folder / "law.py").write_text(
+        "from gain_beside import GAIN\n\n"
+        "class Law:\n    def update(self, observation):\n        return GAIN\n"
+    )
+    for _ in range(2):
+        assert make_controller("laws/law.py:Law", LOOP).update(SEEN) == 0.5
+    assert sys.path.count(str(folder)) == 1
+    assert sys.path[-1] == str(folder)  # last: the files in the folder hide no other module
 
 
 @pytest.mark.parametrize(
