@@ -57,11 +57,11 @@ class LateralControlVector(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
 
     The options are those of `LateralControl`. The options for road, traffic, friction, mass, start
     and light (PER_CAR), and each entry of `start`, are one value for all cars or a list with one
-    value for each car. A tuple (least, greatest) is a range from which each episode draws a number.
-    At most `threads` threads step the cars; None gives one per core, with at least 32 cars per
-    thread. `workers` processes draw the pictures, if there are any; None gives one per core. If
-    `copy` is False, the pictures of an observation are arrays in the memory shared with the
-    workers, and the next `step` or `reset` overwrites them.
+    value for each car. `lanes`, `lane_width`, `friction`, `mass` and the entries of `start` can be
+    ranges (least, greatest), from which each episode draws a number. At most `threads` threads step
+    the cars; None gives one per core, with at least 32 cars per thread. `workers` processes draw
+    the pictures; None gives one per core. If `copy` is False, the pictures of an observation are
+    arrays in memory shared with the workers, and the next `step` or `reset` overwrites them.
 
     Raises UserError, which names the car, for bad options and actions; then no car has moved.
     Raises PictureWorkerError if a worker dies; `reset` starts new workers.

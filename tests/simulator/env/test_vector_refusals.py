@@ -1,11 +1,14 @@
 """Options, actions and resets that a vector environment refuses, with the number of the car."""
 
+import re
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from simulator.env.vector import PER_CAR
 from tests.simulator.env.test_vector import ID, assert_equal, make_vector
 from trackfeatures.errors import UserError
 
@@ -40,6 +43,22 @@ from trackfeatures.errors import UserError
 def test_bad_options_name_the_car(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         make_vector(3, **options)
+
+
+def test_the_page_names_the_options_that_take_ranges() -> None:
+    """`start` takes ranges as its entries, so it is no range itself."""
+    root = Path(__file__).parents[3]
+    page = (root / "docs" / "how-to" / "vector-environments.md").read_text(encoding="utf-8")
+    (line,) = (row for row in page.splitlines() if "a tuple `(least, greatest)`" in row)
+    named = set(re.findall("`([a-z_]+)`", line.split("a tuple")[0]))
+    taken = {"start"}
+    for name in PER_CAR:
+        try:
+            make_vector(1, **({"track": "oval"} | {name: (3, 3)})).close()
+        except UserError:
+            continue
+        taken.add(name)
+    assert named == taken
 
 
 @pytest.mark.parametrize("count", [0, -1, 2.0, True, "3", None])
