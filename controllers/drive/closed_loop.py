@@ -128,7 +128,9 @@ class DriveResult:
     JSON they are fields of the result itself."""
     speed_error_m_s: float | None = None
     """Mean absolute difference of the speed from the value of `--speed` on free straights; None
-    (absent from JSON) in a drive without `--speed`."""
+    without `--speed`, or if the road was not free for long enough."""
+    set_speed: bool = False
+    """True in a drive with `--speed`. JSON then has `speed_error_m_s`; it never has `set_speed`."""
 
     def per_step(self, reward: str) -> float:
         """Return the mean of the reward called `reward`, paper or quadratic, over the requested
@@ -138,7 +140,7 @@ class DriveResult:
     def as_json(self) -> dict[str, Any]:
         """Return the fields as values for JSON."""
         values = asdict(self)
-        if self.speed_error_m_s is None:
+        if not values.pop("set_speed"):
             del values["speed_error_m_s"]
         values["speed_kmh"] = list(self.speed_kmh)
         if self.cruising_kmh is not None:
@@ -189,7 +191,8 @@ def run_lap(
         *(memory.blind_steps, slowed_steps, noisy),
     )
     result = driven.result(steps, world.road, lane_centre, world.frequency_hz)
-    return replace(result, speed_error_m_s=pedals.mean_error)
+    holds_speed = not isinstance(pedals, HeldThrottle)
+    return replace(result, speed_error_m_s=pedals.mean_error, set_speed=holds_speed)
 
 
 def check_reward(name: str) -> None:

@@ -1,6 +1,7 @@
 """Driving at a set speed: the limit in perceived bends, and drives with and without traffic."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -105,6 +106,13 @@ def test_the_speed_is_held_and_bends_are_driven_slower(track: str, speed: float)
     assert max(watch.side) < 1.2 * LATERAL_ACCELERATION
     assert result.max_abs_d_m < 0.3
     assert max(watch.gears) >= 2
+
+
+def test_the_result_of_a_drive_without_a_free_straight_has_a_null_speed_error() -> None:
+    short = DriveConfig(track="highway", speed=25.0, steps=20)
+    assert drive(short).as_json()["speed_error_m_s"] is None
+    held = drive(replace(short, speed=None)).as_json()
+    assert not {"speed_error_m_s", "set_speed"} & set(held)
 
 
 def test_traffic_is_followed_without_a_collision() -> None:
