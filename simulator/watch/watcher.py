@@ -143,6 +143,7 @@ def _world_of(drive: Any) -> World:
     if not isinstance(world, World):
         raise UserError(
             f"a Watcher cannot show {type(drive).__name__}: pass a World or an environment of "
-            "simulator.env (of a vector environment, one of its environments)"
+            "simulator.env; of the vector environments of simulator.env pass "
+            "envs.unwrapped.world(0), of SyncVectorEnv envs.envs[0]"
         )
     return world

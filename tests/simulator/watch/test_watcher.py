@@ -147,6 +147,21 @@ def test_objects_without_a_world_are_refused() -> None:
         watcher.update("my env")
 
 
+def test_the_refusal_of_a_vector_environment_names_what_can_be_shown() -> None:
+    name = "driverview/LateralControl-v0"
+    own: Any = gymnasium.make_vec(name, 2, vectorization_mode="vector_entry_point", track="oval")
+    single: Any = gymnasium.make_vec(name, 2, vectorization_mode="sync", track="oval")
+    with Watcher(port=0) as watcher:
+        for envs in (own, single):
+            envs.reset(seed=0)
+            with pytest.raises(UserError, match=r"envs\.unwrapped\.world\(0\).*envs\.envs\[0\]"):
+                watcher.update(envs)
+        watcher.update(own.unwrapped.world(0))
+        watcher.update(single.envs[0])
+    own.close()
+    single.close()
+
+
 def test_close_frees_the_port_and_a_port_in_use_is_refused() -> None:
     with Watcher(port=0) as watcher:
         port = int(watcher.url.rsplit(":", 1)[1])
