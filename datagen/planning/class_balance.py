@@ -25,7 +25,7 @@ from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
 from simulator.track.random_roads.road import RANDOM, random_track
 from simulator.track.road import Road
-from simulator.traffic.traffic import DESIRED_KMH
+from simulator.traffic.traffic import DESIRED_KMH, most_cars
 
 FloatArray = NDArray[np.float64]
 KMH = 3.6  # km/h per m/s
@@ -95,8 +95,16 @@ class TrackForecast:
             )
         return np.asarray(spent / spent.sum(axis=1, keepdims=True))
 
+    def with_fitting_traffic(self, entry: RoundPlan) -> RoundPlan:
+        """Return the round `entry` with at most as many other cars as fit on its road."""
+        most = most_cars(self._track(entry.track).length_m, entry.lanes)
+        return replace(entry, traffic=min(entry.traffic, most))
+
+    def _track(self, name: str) -> Track:
+        return self._tracks[name] if name in self._tracks else random_track(name)
+
     def _lap_profile(self, name: str, lanes: int, lane_width_m: float) -> _LapProfile:
-        track = self._tracks[name] if name in self._tracks else random_track(name)
+        track = self._track(name)
         profile = bend_profile(track, max_offset(Road(track, lanes, lane_width_m)))
         share = placement_share(track)
         placed = _is_class(track, len(share)) @ share

@@ -12,7 +12,7 @@ import numpy as np
 
 import trackfeatures as tf
 from datagen.driving.trajectory import TRAJECTORIES
-from datagen.planning.class_balance import Forecast, balance_starts
+from datagen.planning.class_balance import TrackForecast, balance_starts
 from datagen.planning.config import FRAMES_PER_SCENE, SEEDS_PER_PLAN, CollectConfig, TrackChoice
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.split import choose_test_rounds
@@ -28,10 +28,11 @@ CAMERA_JITTER = {"z": 0.08, "pitch_deg": 1.5, "fov_y_deg": 3.0}  # half widths i
 Value = TypeVar("Value")
 
 
-def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
+def make_plan(config: CollectConfig, forecast: TrackForecast | None = None) -> Plan:
     """Make the plan of these options; the same options always give the same plan.
 
-    With a `forecast`, the starts of the rounds are chosen so that no class of the road is rare.
+    With a `forecast`, a round has at most as many other cars as fit on its road, and the starts of
+    the rounds are chosen so that no class of the road is rare.
     """
     # The order of the random choices below determines every plan: changing it changes all datasets.
     rng = np.random.default_rng([config.seed, 0])
@@ -76,7 +77,9 @@ def make_plan(config: CollectConfig, forecast: Forecast | None = None) -> Plan:
         )
         for number in range(count)
     )
-    return Plan(config, rounds if forecast is None else balance_starts(rounds, forecast))
+    if forecast is not None:
+        rounds = balance_starts([forecast.with_fitting_traffic(e) for e in rounds], forecast)
+    return Plan(config, rounds)
 
 
 def stratified_shuffle(

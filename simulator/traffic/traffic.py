@@ -34,7 +34,16 @@ LATERAL_ACCELERATION = 3.0
 
 _PER_CAR_M = 50.0  # least length of the start range divided by the number of cars
 _MIN_SPACING_M = TRAFFIC_CAR_SIZE[0] + 12.0
+# least distance between the middles of the ego car and of a traffic car at the start
+_NEAREST_M = MIN_START_GAP_M + 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0])
 _CELL_M = 1.0
+
+
+def most_cars(length_m: float, lanes: int) -> int:
+    """Return the largest number of traffic cars that fit on a road of `length_m` with `lanes`
+    lanes; 0 if the road has no room."""
+    room = length_m - 2 * _NEAREST_M
+    return min(lanes * max(int(room / _MIN_SPACING_M), 0), MAX_CARS)
 
 
 class Traffic:
@@ -184,12 +193,11 @@ class Traffic:
     def _initial_cars(self, count: int, rng: np.random.Generator, ego_s: float) -> FloatArray:
         """Return a table of `count` random cars ahead of `ego_s` (m), the start of the ego car.
         Raises UserError if there is no room."""
-        nearest = MIN_START_GAP_M + 0.5 * (TRAFFIC_CAR_SIZE[0] + EGO_CAR_SIZE[0])
-        room = self._length - 2 * nearest
+        room = self._length - 2 * _NEAREST_M
         lanes = len(self._lane_y)
         if not isinstance(count, int | np.integer) or isinstance(count, bool):
             raise UserError(f"the number of traffic cars is {count!r}; give a whole number")
-        fits = min(lanes * max(int(room / _MIN_SPACING_M), 0), MAX_CARS)
+        fits = most_cars(self._length, lanes)
         if not 0 <= count <= fits:
             raise UserError(
                 f"{count} traffic cars asked for, but {self.road.track.name!r} with {lanes} "
@@ -200,7 +208,7 @@ class Traffic:
         reach = min(room, max(START_RANGE_M, _PER_CAR_M * count))
         for number in range(lanes):
             rows = np.flatnonzero(lane == number)
-            ahead = nearest + _random_places(len(rows), reach, rng)
+            ahead = _NEAREST_M + _random_places(len(rows), reach, rng)
             cars[rows, car_table.S] = (ego_s + ahead) % self._length
             cars[rows, car_table.Y] = self._lane_y[number]
             cars[rows, car_table.DESIRED] = rng.uniform(*DESIRED_KMH, size=len(rows)) / 3.6
