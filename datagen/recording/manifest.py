@@ -18,6 +18,7 @@ from datagen.recording.folder import (
     PUBLISHED_FILES,
     end_merge,
     read_states,
+    state_path,
     write_if_changed,
 )
 from datagen.recording.mcap.index import open_round
@@ -96,7 +97,7 @@ def current_split(
 ) -> Split:
     """Return the split of a plan, with only the rounds whose ids are in `listed`; or, if the user
     has replaced it (for example by a split of `datagen split --by track --name NAME`), the split in
-    `folder`, also with only these rounds.
+    `folder`, with only these rounds and the recorded rounds whose file is missing now.
 
     `side_of` contains the side of each planned round by id. `added` are the ids of rounds that are
     new in `folder`; those that its split does not name are on their planned side. All other rounds
@@ -110,13 +111,15 @@ def current_split(
     found = read_split(path)
     named = {i for side in SIDES for i in getattr(found, side)}
     new = {*added} - named
-    moved = any(found.side(i) != planned.side(i) for i in named.intersection(listed))
+    # A round whose file was deleted is recorded again: until then the user's split keeps its side.
+    kept = {*listed, *(i for i in side_of if state_path(folder, i).exists())}
+    moved = any(found.side(i) != side_of[i] for i in named & kept)
     known = read_states(folder).keys() & side_of.keys() - new
     if not moved and not known - named - {*planned.recovered}:
         return planned
     sides = {
         side: (
-            *(i for i in getattr(found, side) if i in listed),
+            *(i for i in getattr(found, side) if i in kept),
             *(i for i in getattr(planned, side) if i in new),
         )
         for side in SIDES

@@ -72,6 +72,33 @@ def test_a_split_of_the_users_own_stays_when_collected_again(
     assert Dataset.open(folder).content_hash == json.loads(done.stdout)["content_hash"]
 
 
+@pytest.mark.parametrize("moved", [("round-000", "round-001", "round-002"), ("round-002",)])
+def test_a_round_recorded_again_keeps_its_side_after_an_interruption(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: tuple[str, ...]
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(whole, folder)
+    planned = read_split(split_path(folder))
+    train, test = (
+        tuple(
+            i for i in (*planned.train, *planned.test) if (planned.side(i) == side) ^ (i in moved)
+        )
+        for side in ("train", "test")
+    )
+    own = replace(planned, train=train, test=test)
+    write_split(split_path(folder), own)
+    (folder / "rounds" / "round-002.mcap").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr("datagen.execution.process_pool.ProcessPool.run", _killed)
+        assert datagen_here("collect", *ROUNDS, "--out", folder).returncode == 130
+    assert len(Dataset.open(folder).rounds) == 2
+    done = datagen_here("collect", *ROUNDS, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    assert {*read_split(split_path(folder)).train} == {*train}
+    assert {*read_split(split_path(folder)).test} == {*test}
+    assert verify(folder, "full").ok
+
+
 @pytest.mark.parametrize("killed", ["no", "yes", "earlier version"])
 def test_a_split_of_the_users_own_stays_when_more_rounds_are_merged(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: str
