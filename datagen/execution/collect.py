@@ -179,6 +179,7 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         found_hash, definitions, options = found["hash"], found["definitions"], found["wanted"]
         maker, driver = found["program"], found.get("driver", {})
         changed = changed_track(found["rounds"], [entry.as_dict() for entry in plan.rounds])
+        bent = _changed_geometry(found["rounds"], plan)
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"{path} cannot be read ({error!r}); choose another folder with --out"
@@ -191,6 +192,11 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         )
     if driver and DRIVER_FILES not in driver:  # a plan of an earlier version
         plan = replace(plan, driver={k: v for k, v in plan.driver.items() if k != DRIVER_FILES})
+    if bent is not None:
+        raise DatasetError(
+            f"{folder} was begun with another geometry of the track {bent}; restore the track to "
+            "finish it, or choose another folder with --out"
+        )
     if found_hash != plan.hash:
         raise DatasetError(
             f"{folder} was begun with another plan ({_differences(options, driver, plan)}); give "
@@ -213,6 +219,15 @@ def foreign_files(folder: Path, plan: Plan) -> list[Path]:
     rounds."""
     names = {f"{entry.id}.mcap" for entry in plan.rounds}
     return [path for path in sorted(folder.glob("rounds/*.mcap")) if path.name not in names]
+
+
+def _changed_geometry(entries: Sequence[dict[str, Any]], plan: Plan) -> str | None:
+    """Return the name of a track whose geometry differs between `entries`, the rounds of the plan
+    in the folder, and `plan`; None if there is none or the rounds are on other tracks."""
+    known = {entry["id"]: (entry["track"], entry["track_hash"]) for entry in entries}
+    if {i: track for i, (track, _) in known.items()} != {e.id: e.track for e in plan.rounds}:
+        return None
+    return next((e.track for e in plan.rounds if e.track_hash != known[e.id][1]), None)
 
 
 def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -> str:

@@ -16,7 +16,7 @@ import trackfeatures as tf
 from datagen.cli.collect import Lights
 from datagen.execution.collect import collect, initialise_folder, require_matching_folder
 from datagen.execution.merge import merge
-from datagen.planning.config import CollectConfig, all_lights
+from datagen.planning.config import CollectConfig, TrackChoice, all_lights
 from datagen.planning.plan import Plan, RoundPlan
 from datagen.planning.planner import make_plan
 from datagen.planning.tracks import choose_tracks
@@ -209,6 +209,17 @@ def test_a_dataset_is_not_continued_on_a_track_of_another_look_paint_or_surface(
         del entry["picture_hash"]
     (folders[0] / "plan.json").write_text(json.dumps(earlier))  # as earlier versions wrote it
     require_matching_folder(folders[0], changed)
+
+
+def test_the_refusal_of_a_changed_geometry_names_the_track(tmp_path: Path) -> None:
+    def plan(content: str) -> Plan:
+        tracks = TrackChoice("mine", content, content), TrackChoice("other", "cc", "cc")
+        return make_plan(CollectConfig(rounds=4, frames=20, tracks=tracks))
+
+    initialise_folder(tmp_path, plan("aa"))
+    with pytest.raises(DatasetError, match="begun with another geometry of the track mine; rest"):
+        require_matching_folder(tmp_path, plan("bb"))
+    require_matching_folder(tmp_path, plan("aa"))
 
 
 def test_without_a_renderer_the_error_says_what_to_install(tmp_path: Path) -> None:
