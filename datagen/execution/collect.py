@@ -137,7 +137,7 @@ def _write_derived_files(
 def _failure_message(failures: Sequence[Failure], planned: int) -> str:
     names = ", ".join(failure.round_id for failure in failures)
     if all(failure.final for failure in failures):
-        advice = "other --tracks or another --seed, with another --out, may avoid this"
+        advice = "other tracks or another --seed, with another --out, may avoid this"
     else:
         advice = "run the same command again for another attempt"
     return (
@@ -180,6 +180,7 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         maker, driver = found["program"], found.get("driver", {})
         changed = changed_track(found["rounds"], [entry.as_dict() for entry in plan.rounds])
         bent = _changed_geometry(found["rounds"], plan)
+        other = _other_round(found["rounds"], plan) if found_hash != plan.hash else ""
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
             f"{path} cannot be read ({error!r}); choose another folder with --out"
@@ -198,9 +199,10 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
             "finish it, or choose another folder with --out"
         )
     if found_hash != plan.hash:
+        differences = _differences(options, driver, plan) or other
         raise DatasetError(
-            f"{folder} was begun with another plan ({_differences(options, driver, plan)}); give "
-            "the same options to finish it, or choose another folder with --out"
+            f"{folder} was begun with another plan ({differences}); give the "
+            "same options to finish it, or choose another folder with --out"
         )
     if changed is not None:
         raise DatasetError(
@@ -242,7 +244,21 @@ def _differences(found: dict[str, Any], driver: Mapping[str, str], plan: Plan) -
     ]
     if plan.driver != driver:
         named.append(f"driver: {_named(driver)} in its plan, now {_named(plan.driver)}")
-    return "; ".join(named) or "the same options, other rounds"
+    return "; ".join(named)
+
+
+def _other_round(entries: Sequence[dict[str, Any]], plan: Plan) -> str:
+    """Describe the first difference between `entries`, the rounds of the plan in the folder, and
+    the rounds of `plan`. The option --laps of `datagen protocol` is only in the rounds."""
+    if len(entries) != len(plan.rounds):
+        return f"{len(entries)} rounds in its plan, now {len(plan.rounds)}"
+    wanted = json.loads(json.dumps([entry.as_dict() for entry in plan.rounds]))
+    for found, entry in zip(entries, wanted, strict=True):
+        for name, value in entry.items():
+            if name != "picture_hash" and found.get(name) != value:
+                was = _short(found.get(name))
+                return f"{name} of {entry['id']}: {was} in its plan, now {_short(value)}"
+    return "the same options, other rounds"
 
 
 def _named(driver: Mapping[str, str]) -> str:

@@ -222,6 +222,20 @@ def test_the_refusal_of_a_changed_geometry_names_the_track(tmp_path: Path) -> No
     require_matching_folder(tmp_path, plan("aa"))
 
 
+def test_a_plan_with_other_rounds_of_the_same_options_names_the_first_difference(
+    tmp_path: Path,
+) -> None:
+    plan = make_small_plan(3, 20)
+    initialise_folder(tmp_path, plan)
+    entries = list(plan.rounds)
+    entries[1:] = [replace(entry, frames=99) for entry in entries[1:]]
+    words = re.escape("another plan (frames of round-001: 20 in its plan, now 99)")
+    with pytest.raises(DatasetError, match=words):
+        require_matching_folder(tmp_path, replace(plan, rounds=tuple(entries)))
+    with pytest.raises(DatasetError, match=r"another plan \(3 rounds in its plan, now 2\)"):
+        require_matching_folder(tmp_path, replace(plan, rounds=plan.rounds[:2]))
+
+
 def test_without_a_renderer_the_error_says_what_to_install(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     environment = os.environ | {"__EGL_VENDOR_LIBRARY_FILENAMES": str(tmp_path / "nothing.json")}
