@@ -124,6 +124,26 @@ def test_a_split_of_the_users_own_stays_when_more_rounds_are_merged(
     assert verify(out, "full").ok
 
 
+def test_the_copied_rounds_of_an_interrupted_merge_are_a_dataset(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied: list[object] = []
+
+    def copy_one(source: Path, target: Path) -> None:
+        if copied:
+            raise KeyboardInterrupt
+        copied.append(target.write_bytes(source.read_bytes()))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("datagen.execution.merge.shutil.copyfile", copy_one)
+        with pytest.raises(KeyboardInterrupt):
+            merge([whole], tmp_path / "out")
+    assert len(Dataset.open(tmp_path / "out").rounds) == 1
+    assert merge([whole], tmp_path / "out").rounds == 3
+    assert read_split(split_path(tmp_path / "out")) == read_split(split_path(whole))
+    assert verify(tmp_path / "out", "full").ok
+
+
 def test_a_half_merged_dataset_is_not_collected(
     whole: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
