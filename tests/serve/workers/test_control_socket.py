@@ -2,7 +2,9 @@
 
 import asyncio
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -13,9 +15,16 @@ from trackfeatures.errors import UserError
 PORT = 8000
 
 
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """A folder with a short path: the path of a socket may have at most 107 bytes."""
+    with TemporaryDirectory(prefix="dv") as folder:
+        yield Path(folder)
+
+
 @pytest.fixture(autouse=True)
-def socket_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def socket_folder(short_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(short_path))
 
 
 @pytest.mark.parametrize(
@@ -80,14 +89,14 @@ def test_two_services_with_one_port_do_not_take_each_others_commands(
 
 @pytest.mark.parametrize("has_login", [False, True])
 def test_a_service_that_was_started_in_another_environment_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_login: bool
+    short_path: Path, monkeypatch: pytest.MonkeyPatch, has_login: bool
 ) -> None:
     """systemd and cron set no XDG_RUNTIME_DIR, a login does. `has_login`: whether the service is
     started in a login and the command is not."""
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(module, "RUNTIME_FOLDERS", tmp_path)
-    login = tmp_path / str(os.getuid())
-    for folder in (tmp_path / "tmp", login):
+    monkeypatch.setattr("tempfile.tempdir", str(short_path / "tmp"))
+    monkeypatch.setattr(module, "RUNTIME_FOLDERS", short_path)
+    login = short_path / str(os.getuid())
+    for folder in (short_path / "tmp", login):
         folder.mkdir()
 
     def enter(runtime: Path | None) -> None:
@@ -111,10 +120,10 @@ def test_a_service_that_was_started_in_another_environment_is_found(
 
 
 def test_a_socket_in_the_folder_of_another_user_does_not_hide_ours(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    foreign, ours = tmp_path / "foreign", tmp_path / "tmp" / f"driverview-{os.getuid()}"
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    foreign, ours = short_path / "foreign", short_path / "tmp" / f"driverview-{os.getuid()}"
+    monkeypatch.setattr("tempfile.tempdir", str(short_path / "tmp"))
     monkeypatch.setattr(module, "_is_ours", lambda folder: folder != foreign)
     for folder in (foreign, ours):
         folder.mkdir(parents=True, mode=0o700)
