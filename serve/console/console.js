@@ -15,13 +15,19 @@ $("base").textContent = location.origin;
 
 const authorization = () => ($("token").value ? { Authorization: `Bearer ${$("token").value}` } : {});
 
-// Loads and shows the model card, then sends the current picture. After a 401 the token's field is visible.
+// The text of a refusal. After a 401 the token's field is visible.
+function problem(reply, answer) {
+  if (reply.status !== 401) return `${answer.title ?? reply.statusText}: ${answer.detail ?? ""}`;
+  $("locked").hidden = false;
+  return $("token").value ? "the service has another token" : "enter the service's token below the picture";
+}
+
+// Loads and shows the model card, then sends the current picture.
 async function loadModel() {
   const reply = await fetch("model", { headers: authorization() });
   const answer = await reply.json();
-  if (reply.status === 401) $("locked").hidden = false;
   if (!reply.ok) {
-    $("model").textContent = answer.detail;
+    $("model").textContent = problem(reply, answer);
     return;
   }
   model = answer;
@@ -47,8 +53,7 @@ async function ask() {
     Object.assign(headers, authorization());
     const reply = await fetch("features", { method: "POST", headers, body });
     const answer = await reply.json();
-    if (reply.status === 401) $("locked").hidden = false;
-    if (!reply.ok) return refuse(`${answer.title ?? reply.statusText}: ${answer.detail ?? ""}`, image);
+    if (!reply.ok) return refuse(problem(reply, answer), image);
     latencies.push({ trip: performance.now() - started, total: answer.timing_ms.total, ...answer.timing_ms });
     latencies.splice(0, latencies.length - KEPT);
     show(image, answer, truth, named);

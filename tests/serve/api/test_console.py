@@ -234,9 +234,12 @@ globalThis.fetch = async (path, options = {}) => {
 await import(process.argv[2]);
 const shown = () => [element("locked").hidden, element("model").textContent];
 const before = shown();
-element("token").value = "right";
-await listeners["token change"]();
-console.log(JSON.stringify([before, shown()]));
+const entered = async (token) => {
+  element("token").value = token;
+  await listeners["token change"]();
+  return shown();
+};
+console.log(JSON.stringify([before, await entered("wrong"), await entered("right")]));
 """
 """A script for node: the console on a fake page of a service with the token `right`."""
 
@@ -247,6 +250,7 @@ def test_the_page_of_a_service_with_a_token_asks_for_it(tmp_path: Path) -> None:
     file.write_text(PAGE)
     words = ["node", str(file), (FOLDER / "console.js").as_uri()]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
-    before, after = json.loads(done.stdout)
-    assert before == [False, "no token"]
+    before, refused, after = json.loads(done.stdout)
+    assert before == [False, "enter the service's token below the picture"]
+    assert refused == [False, "the service has another token"]
     assert after[1].startswith("model abababababab, fake f32, camera 280 ")
