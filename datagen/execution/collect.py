@@ -179,7 +179,7 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         found_hash, definitions, options = found["hash"], found["definitions"], found["wanted"]
         maker, driver = found["program"], found.get("driver", {})
         changed = changed_track(found["rounds"], [entry.as_dict() for entry in plan.rounds])
-        bent = _changed_geometry(found["rounds"], plan)
+        reshaped = _changed_geometry(found["rounds"], plan)
         other = _other_round(found["rounds"], plan) if found_hash != plan.hash else ""
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(
@@ -193,10 +193,10 @@ def require_matching_folder(folder: Path, plan: Plan) -> None:
         )
     if driver and DRIVER_FILES not in driver:  # a plan of an earlier version
         plan = replace(plan, driver={k: v for k, v in plan.driver.items() if k != DRIVER_FILES})
-    if bent is not None:
+    if reshaped is not None:
         raise DatasetError(
-            f"{folder} was begun with another geometry of the track {bent}; restore the track to "
-            "finish it, or choose another folder with --out"
+            f"{folder} was begun with another geometry of the track {reshaped}; restore the "
+            "track to finish it, or choose another folder with --out"
         )
     if found_hash != plan.hash:
         differences = _differences(options, driver, plan) or other
