@@ -1,7 +1,6 @@
 """The service as one ASGI application. It handles POST /features and /stream; FastAPI handles the
 other paths."""
 
-import os
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -15,6 +14,7 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from mtlnet.inference.engine import Engine, view_count
+from runtime.processor import usable_cores
 from serve import problems
 from serve.api import kserve, schemas
 from serve.api.access import PROBES, Access
@@ -69,7 +69,7 @@ class Service:
         streams = StreamTable(self.shared.streams())
         workers = self.shared.workers
         self.frame_queue = FrameQueue(
-            engine, check, streams, self.limits.queue, _cores() < 2 * workers, cameras
+            engine, check, streams, self.limits.queue, usable_cores() < 2 * workers, cameras
         )
         self.metrics = Metrics(self.shared, block)
         self.bodies = BodyBudget(self.shared, block, self.limits.body_mib << 20)
@@ -115,13 +115,6 @@ def _request_tracer(tracer: "Tracer") -> "RequestTracer":
     from serve.observability.tracing import RequestTracer  # needs the extra `telemetry`
 
     return RequestTracer(tracer)
-
-
-def _cores() -> int:
-    """The number of cores available to this process."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _framework(service: Service) -> FastAPI:

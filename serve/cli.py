@@ -46,9 +46,19 @@ RayPort = Annotated[
 Workers = Annotated[
     int,
     typer.Option(
-        help="Number of worker processes; each needs one CPU core to compute answers.",
+        help="Number of worker processes, which compute answers at the same time.",
         min=1,
         max=256,
+    ),
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        help="Number of threads that compute an answer in each worker process. Default: 2 if "
+        "there are two cores for each worker and the processor has no instructions for int8 and "
+        "bf16 numbers, else 1.",
+        min=1,
+        max=64,
     ),
 ]
 Replicas = Annotated[
@@ -140,6 +150,7 @@ def serve(
     host: Host = ServiceConfig.host,
     port: Port = ServiceConfig.port,
     workers: Workers = ServiceConfig.workers,
+    threads: Threads = None,
     token_file: TokenFile = None,
     insecure: Insecure = False,
     rate: RequestRate = Limits.rate,
@@ -174,7 +185,7 @@ def serve(
         body_mib=body_mib,
     )
     cameras = tuple(camera or ())
-    run(ServiceConfig(model, host, port, workers, insecure, limits, cameras, views))
+    run(ServiceConfig(model, host, port, workers, insecure, limits, cameras, views, threads))
 
 
 def _check_no_options(context: typer.Context) -> None:

@@ -59,6 +59,8 @@ class ServiceConfig:
     """NAME=FILE of each camera that requests can name."""
     views: int = 1
     """Number of views of each image whose answers are averaged: 1, 2 or 6."""
+    threads: int | None = None
+    """Number of threads with which each worker computes an answer; None: `default_threads`."""
 
 
 def check_proxies(proxies: Iterable[str]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Starts the service (checks, listening sockets, first line on stderr) and shuts it down cleanly.
 
-Each worker process has one engine with one thread, because two threads in one process slow each
-other down. All workers share the listening sockets; `serve.workers.supervisor` manages them.
+Each worker process has one engine, which computes one answer at a time. All workers share the
+listening sockets; `serve.workers.supervisor` manages them.
 """
 
 import asyncio
@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mtlnet.inference.model_card import read_card, resolve_run
 from runtime.access import check_exposure
+from runtime.processor import has_bf16, has_int8, usable_cores
 from runtime.sockets import address, bind_all, shown_addresses
 from serve.config import ServiceConfig
 from serve.observability import logs, telemetry
@@ -34,7 +35,13 @@ def run(config: ServiceConfig) -> None:
 async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
     cameras = partial(_cameras, config.cameras)
     plan = ServicePlan(
-        config.model, resolve_run, config.workers, config.limits, cameras, config.views
+        config.model,
+        resolve_run,
+        config.workers,
+        config.limits,
+        cameras,
+        config.views,
+        config.threads or default_threads(config.workers),
     )
     supervisor = Supervisor(plan, listeners)
     port = listeners[0].getsockname()[1]
@@ -44,6 +51,7 @@ async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
     sys.stderr.write(
         f"serving {_model_label(config.model, supervisor.folder)}, model {first['model'][:12]}, "
         f"with {first['engine']} {first['precision']}"
+        f"{f' on {plan.threads} threads' if plan.threads > 1 else ''}"
         f"{f' and --views {config.views}' if config.views > 1 else ''} "
         f"at {address(listeners[0], config.host)}"
         f"{f' ({shown_addresses(listeners)})' if len(listeners) > 1 else ''}"
@@ -63,6 +71,17 @@ async def _serve(config: ServiceConfig, listeners: list[socket.socket]) -> None:
     if command_server is not None:
         command_server.close()
         socket_path(port).unlink(missing_ok=True)
+
+
+def default_threads(workers: int) -> int:
+    """Return the number of threads with which each of `workers` workers computes an answer.
+
+    It is 2 if each worker has two cores and the processor has no instructions for int8 and bf16.
+    An answer then takes 0.7 of its time with one thread. With these instructions a forward pass is
+    so short that two threads take longer than one (docs/experiments/service-load.md).
+    """
+    slow = not (has_int8() or has_bf16())
+    return 2 if slow and usable_cores() >= 2 * workers else 1
 
 
 def _cameras(options: tuple[str, ...], run: Path) -> dict[str, CameraParameters]:

@@ -78,7 +78,7 @@ def main() -> None:
     shared = attach_shared_memory(task.memory, task.blocks)
     logs.set_up(shared.workers)
     try:
-        engine = load(Path(task.folder), task.expected, views=task.views)
+        engine = load(task, task.folder, task.expected)
     except UserError as error:
         supervisor.send(failed=task.generation, why=str(error))
         return
@@ -89,17 +89,17 @@ def main() -> None:
     app.frame_queue.on_warm(lambda: send_ready(supervisor))
     peers = WorkerPeers(shared, task.block)
     server = WorkerServer(app, task.limits, peers)
-    arguments = (supervisor, lines, server, app, task.views)
+    arguments = (supervisor, lines, server, app, task)
     threading.Thread(target=handle_commands, args=arguments, daemon=True).start()
     server.run(sockets=[socket.socket(fileno=number) for number in task.listeners])
     peers.withdraw()
 
 
-def load(folder: Path, expected: str | None, *, views: int) -> Engine:
-    """Load the engine of the model in `folder`. `expected`: the required hash of the weights; None
-    accepts any. `views`: number of views of each image whose answers are averaged. Raises UserError
-    if the model cannot be loaded or its weights have another hash."""
-    engine = load_engine(folder, views=views)
+def load(task: WorkerTask, folder: str, expected: str | None) -> Engine:
+    """Load the engine of the model in `folder`, with the views and threads of `task`. `expected`:
+    the required hash of the weights; None accepts any. Raises UserError if the model cannot be
+    loaded or its weights have another hash."""
+    engine = load_engine(Path(folder), threads=task.threads, views=task.views)
     found = engine.card.model_hash
     if expected is not None and found != expected:
         raise UserError(
@@ -122,14 +122,14 @@ def handle_commands(
     lines: Iterator[str],
     server: WorkerServer,
     app: Service,
-    views: int,
+    task: WorkerTask,
 ) -> None:
     """Execute the supervisor's commands until it closes the socket, then stop the server."""
     for line in lines:
         message = json.loads(line)
         if "load" in message:
             cameras = read_cameras(message["cameras"])
-            reload(supervisor, app, message["load"], message["generation"], cameras, views=views)
+            reload(supervisor, app, task, message["load"], message["generation"], cameras)
         elif "drop" in message:
             app.frame_queue.drop_staged_model()
     server.should_exit = True
@@ -138,18 +138,17 @@ def handle_commands(
 def reload(
     supervisor: SupervisorConnection,
     app: Service,
+    task: WorkerTask,
     folder: str,
     generation: int,
     cameras: Cameras,
-    *,
-    views: int,
 ) -> None:
     """Load and check new weights while the old weights are in use. The new weights and `cameras`,
     the cameras that clients can name, replace the old ones once the supervisor commits
     `generation`."""
     head = app.shared.head()
     try:
-        engine = load(Path(folder), None, views=views)
+        engine = load(task, folder, None)
         warm_up(engine)
     except UserError as error:
         supervisor.send(failed=generation, why=str(error))

@@ -42,7 +42,8 @@ class ServicePlan:
 
     `resolve` maps a model's name to its folder. `cameras` returns the cameras that clients can
     name, by name, for the model in a folder; it raises UserError if a camera does not fit the
-    model. `views`: number of views of each image whose answers are averaged.
+    model. `views`: number of views of each image whose answers are averaged. `threads`: number of
+    threads with which each worker computes an answer.
     """
 
     model: str
@@ -51,6 +52,7 @@ class ServicePlan:
     limits: Limits
     cameras: Callable[[Path], Mapping[str, CameraParameters]] = lambda _folder: {}
     views: int = 1
+    threads: int = 1
 
 
 class Supervisor:
@@ -271,6 +273,7 @@ class Supervisor:
             limits=self._plan.limits,
             cameras=self._cameras,
             views=self._plan.views,
+            threads=self._plan.threads,
         )
 
     def _free_block(self, without: WorkerProcess | None = None) -> int:

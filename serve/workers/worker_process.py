@@ -30,6 +30,7 @@ class WorkerTask:
     file descriptors of the listening sockets and of the shared memory. `block`: number of the
     worker's block of the shared memory, which has `blocks` blocks. `cameras`: the cameras that
     clients can name, by name. `views`: number of views of each image whose answers are averaged.
+    `threads`: number of threads that compute an answer.
     """
 
     folder: str
@@ -42,6 +43,7 @@ class WorkerTask:
     limits: Limits
     cameras: Mapping[str, CameraParameters] = field(default_factory=dict)
     views: int = 1
+    threads: int = 1
 
     def to_json_line(self) -> bytes:
         """Return the task as one line of JSON."""

@@ -69,17 +69,20 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, st
         stderr=subprocess.PIPE,
         text=True,
     ) as service:
-        assert service.stderr is not None
-        first = service.stderr.readline()
-        address = re.search(r"http://\S+", first)
-        assert address, first + service.stderr.read()
-        image = "from datagen.recording import Dataset; from pathlib import Path; Path('image.jpg')"
-        image += ".write_bytes(bytes(Dataset.open('datasets/default').select('all').jpeg(0)))"
-        subprocess.run([sys.executable, "-c", image], cwd=folder, check=True)
-        drive = [word.replace(ADDRESS, address.group()) for word in chain[4]]
-        run(drive, folder)
-        yield folder, address.group()
-        service.send_signal(signal.SIGTERM)
+        try:
+            assert service.stderr is not None
+            first = service.stderr.readline()
+            address = re.search(r"http://\S+", first)
+            assert address, first + service.stderr.read()
+            image = "from datagen.recording import Dataset; from pathlib import Path; "
+            image += "frames = Dataset.open('datasets/default').select('all'); "
+            image += "Path('image.jpg').write_bytes(bytes(frames.jpeg(0)))"
+            subprocess.run([sys.executable, "-c", image], cwd=folder, check=True)
+            drive = [word.replace(ADDRESS, address.group()) for word in chain[4]]
+            run(drive, folder)
+            yield folder, address.group()
+        finally:
+            service.send_signal(signal.SIGTERM)
 
 
 @pytest.mark.slow

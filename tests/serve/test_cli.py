@@ -162,6 +162,13 @@ def test_views_are_averaged_also_after_a_reload(published: Path) -> None:
             assert done.returncode == 0, done.stderr
 
 
+def test_the_first_line_says_how_many_threads_compute_an_answer(published: Path) -> None:
+    for threads, expected in (("2", " f32 on 2 threads at http"), ("1", " f32 at http")):
+        arguments = ("--model", str(published), "--port", "0", "--threads", threads)
+        with started(*arguments) as (_process, line):
+            assert expected in line.replace("bf16", "f32")
+
+
 def test_an_unusable_model_is_an_error_of_one_line(published: Path, tmp_path: Path) -> None:
     assert "no run" in refused("--model", str(tmp_path / "none"))
     assert "train" in refused("--model", "latest", folder=tmp_path)
