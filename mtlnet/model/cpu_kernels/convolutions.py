@@ -21,6 +21,7 @@ from torch.nn.functional import conv2d, pad
 
 from mtlnet.architecture import same_padding
 from mtlnet.model.cpu_kernels.elementwise import as_rows, centre, in_threads
+from mtlnet.model.cpu_kernels.winograd import winograd_convolution
 
 BLOCK = 4
 ROW_BYTES = 12  # bytes of one row of a block: four pixels of three colours
@@ -67,7 +68,19 @@ def space_to_depth_convolution(
     kernel = kernel.view(filters, 3, 3, BLOCK, 3, BLOCK).permute(0, 3, 5, 1, 2, 4)
     kernel = kernel.reshape(filters, BLOCK * ROW_BYTES, 3, 3).to(dtype)
     kernel = kernel.contiguous(memory_format=torch.channels_last)
-    return conv2d(x, kernel, None if bias is None else bias.to(dtype), padding=1)
+    return convolution_3x3(x, kernel, None if bias is None else bias.to(dtype))
+
+
+def convolution_3x3(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Compute the convolution with padding 1 and stride 1 of `x` (B, C, H, W) by `weight`
+    (F, C, 3, 3), plus `bias` (F,), all channels-last and of one type; the result is (B, F, H, W).
+
+    The gradients are computed by Winograd's algorithm, except in bf16: processors with bf16
+    instructions multiply so fast that the algorithm's transforms would take longer.
+    """
+    if x.dtype == torch.bfloat16:
+        return conv2d(x, weight, bias, padding=1)
+    return winograd_convolution(x, weight, bias)
 
 
 class _Im2colConvolution(torch.autograd.Function):

@@ -10,6 +10,7 @@ from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
 from mtlnet.architecture import GRID, GRID_RESIDUAL, HEIGHT, MTL, Conv, Pool, same_padding
 from mtlnet.model.cpu_kernels.convolutions import (
+    convolution_3x3,
     im2col_convolution,
     space_to_depth,
     space_to_depth_convolution,
@@ -123,4 +124,7 @@ def _convolve(x: Tensor, number: int, spec: Conv, weight: Tensor, bias: Tensor |
             same_padding(size, spec.kernel, spec.stride) for size in (height, width)
         )
         assert (top, left) == (bottom, right)
-    return conv2d(x, weight, None if bias is None else bias.to(x.dtype), spec.stride, (top, left))
+    typed_bias = None if bias is None else bias.to(x.dtype)
+    if (spec.kernel, spec.stride, spec.pad) == (3, 1, 1):
+        return convolution_3x3(x, weight, typed_bias)
+    return conv2d(x, weight, typed_bias, spec.stride, (top, left))

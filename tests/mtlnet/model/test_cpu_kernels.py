@@ -1,6 +1,7 @@
 """The CPU kernels match the plain network: outputs, gradients, running statistics."""
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from mtlnet.model.cpu_kernels.convolutions import (
 from mtlnet.model.cpu_kernels.elementwise import affine_relu, as_rows, in_threads
 from mtlnet.model.cpu_kernels.forward import forward_features, training_outputs
 from mtlnet.model.cpu_kernels.norm_pool_relu import norm_pool_relu, statistics
+from mtlnet.model.cpu_kernels.winograd import IMAGES, winograd_convolution
 from mtlnet.model.network import Network, initialise
 from mtlnet.training.trainer import dropout_masks, freeze_batch_norm
 
@@ -110,6 +112,65 @@ def test_im2col_convolution_matches_conv2d_and_passes_gradcheck() -> None:
     plain = torch.nn.functional.conv2d(torch.nn.functional.pad(x, (1, 1, 0, 1)), weight, stride=2)
     torch.testing.assert_close(im2col_convolution(x, weight, 2), plain)
     assert torch.autograd.gradcheck(lambda a, b: im2col_convolution(a, b, 2), (x, weight))
+
+
+@pytest.mark.parametrize(
+    "size", [(1, 1), (2, 4), (3, 3), (4, 6), (5, 8)], ids=lambda size: f"{size[0]}x{size[1]}"
+)
+def test_winograd_gradients_match_those_of_torch(size: tuple[int, int]) -> None:
+    rng = torch.Generator().manual_seed(0)
+    count = IMAGES + 3  # the last part has fewer images
+    values = [
+        torch.randn(shape, generator=rng) for shape in ((count, 5, *size), (4, 5, 3, 3), (4,))
+    ]
+    x, weight, bias = (value.double().requires_grad_() for value in values)
+    expected = torch.nn.functional.conv2d(x, weight, bias, padding=1)
+    found = winograd_convolution(x, weight, bias)
+    torch.testing.assert_close(found, expected)
+    gradient = torch.randn(found.shape, generator=rng).double()
+    plain, fast = (torch.autograd.grad(y, (x, weight, bias), gradient) for y in (expected, found))
+    for one, other in zip(plain, fast, strict=True):
+        torch.testing.assert_close(other, one)
+
+
+def test_winograd_computes_only_the_gradients_that_are_needed() -> None:
+    rng = torch.Generator().manual_seed(0)
+    image, filters = (torch.randn((2, 3, n, n), generator=rng).double() for n in (5, 3))
+    for frozen in ("image", "filters"):
+        x, weight = image.clone(), filters.clone()
+        trained = weight if frozen == "image" else x
+        trained.requires_grad_()
+        (expected,) = torch.autograd.grad(
+            torch.nn.functional.conv2d(x, weight, padding=1).square().sum(), trained
+        )
+        (found,) = torch.autograd.grad(
+            winograd_convolution(x, weight, None).square().sum(), trained
+        )
+        torch.testing.assert_close(found, expected)
+
+
+def test_winograd_gradients_in_float32_lose_at_most_one_digit() -> None:
+    rng = torch.Generator().manual_seed(0)
+    x = torch.randn((4, 32, 9, 18), generator=rng)
+    weight = torch.randn((16, 32, 3, 3), generator=rng)
+    gradient = torch.randn((4, 16, 9, 18), generator=rng)
+
+    def gradients(convolve: Callable[..., torch.Tensor], dtype: torch.dtype) -> list[torch.Tensor]:
+        inputs = [value.to(dtype).requires_grad_() for value in (x, weight)]
+        found = torch.autograd.grad(convolve(*inputs), inputs, gradient.to(dtype))
+        return [value.double() for value in found]
+
+    def plain(x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.conv2d(x, weight, padding=1)
+
+    def fast(x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        return winograd_convolution(x, weight, None)
+
+    exact = gradients(plain, torch.float64)
+    for one, other, true in zip(
+        gradients(plain, torch.float32), gradients(fast, torch.float32), exact, strict=True
+    ):
+        assert (other - true).norm() < 10 * (one - true).norm()
 
 
 def test_batch_statistics_of_bf16_are_float32() -> None:
