@@ -90,6 +90,7 @@ def export_command(
     data: options.CheckData = None,
     out: options.ExportOut = None,
     frames: options.CheckFrames = 64,
+    gate_only: options.GateOnly = False,
     as_json: command.AsJson = False,
 ) -> None:
     """Write a model in the format ONNX or OpenVINO, and compare its outputs with torch.
@@ -106,7 +107,9 @@ def export_command(
     from mtlnet.export.convert import export_model
     from mtlnet.inference.model_card import resolve_run
 
-    result = export_model(resolve_run(model), form, precision, data, out, frames)
+    result = export_model(
+        resolve_run(model), form, precision, data, out, frames, gate_only=gate_only
+    )
     if as_json:
         typer.echo(json.dumps(result))
     else:

@@ -110,6 +110,16 @@ CheckFrames = Annotated[
         help="Number of frames on which the written model is compared with torch, 1 to 10,000."
     ),
 ]
+GateOnly = Annotated[
+    bool,
+    typer.Option(
+        "--gate-only",
+        help="Evaluate the accuracy gate of the int8 graph that the model has, on this processor, "
+        "and write no graph. It is needed for processors of the other kind (with or without "
+        "instructions for int8 numbers) than the one that exported the graph. With --precision "
+        "int8 only.",
+    ),
+]
 
 # Options of `ship`.
 ShipOut = Annotated[Path, typer.Option(help="Folder to write the model to.")]

@@ -32,7 +32,15 @@ from mtlnet.export.int8 import (
     judge,
     quantise,
 )
-from mtlnet.inference.engine import EXPORT_FILE, best_precision, run_graph
+from mtlnet.inference.engine import (
+    EXPORT_FILE,
+    GATES,
+    INT8,
+    best_precision,
+    int8_graph,
+    read_export,
+    run_graph,
+)
 from mtlnet.inference.model_card import (
     GRAPH,
     GRAPH_WEIGHTS,
@@ -69,17 +77,26 @@ def export_model(
     data: Path | None = None,
     out: Path | None = None,
     frames: int = 64,
+    *,
+    gate_only: bool = False,
 ) -> dict[str, Any]:
     """Write the model of `run` in another format and compare it with torch; returns the result of
     `--json`.
 
     `kind`: "onnx" or "openvino"; `precision`: "f32", "bf16" or "int8". The comparison uses `frames`
     frames of the dataset `data`, by default of the training data, which a shipped model lacks. For
-    int8 it uses frames of the dataset's test rounds only. `out`: the folder to write. Raises
-    UserError for an unsupported export and for missing data, ModelError when an f32 export differs
-    by more than the tolerance.
+    int8 it uses frames of the dataset's test rounds only. `out`: the folder to write.
+    `gate_only`: write no graph, only evaluate the gate of the existing int8 graph
+    (`evaluate_gate`). Raises UserError for an unsupported export and for missing data, ModelError
+    when an f32 export differs by more than the tolerance.
     """
     _require_supported(kind, precision, out, frames)
+    if gate_only:
+        if precision != "int8":
+            raise UserError(
+                f"{precision} has no accuracy gate; give --precision int8 or leave out --gate-only"
+            )
+        return evaluate_gate(run, data)
     card = read_card(run)
     dataset, shown = _open_data(card, precision, data)
     chosen = np.linspace(0, len(shown) - 1, min(frames, len(shown))).astype(np.int64)
@@ -114,6 +131,26 @@ def export_model(
         about["gate"] = judge(run, dataset.path)
         write_export(folder, card, names, **about)
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
+
+
+def evaluate_gate(run: Path, data: Path | None) -> dict[str, Any]:
+    """Evaluate the accuracy gate of the int8 graph of `run` again, on this processor and the test
+    rounds of the dataset `data` (None: of the training data), and store the result with the graph.
+
+    A result of the same kind of processor, with or without native int8, is replaced. Returns the
+    result of `--json`. Raises UserError for missing data, ModelError without an int8 graph.
+    """
+    card = read_card(run)
+    int8_graph(run, card)
+    dataset, _ = _open_data(card, "int8", data)
+    found = judge(run, dataset.path)
+    folder = run / INT8
+    about = read_export(folder)
+    assert about is not None
+    first = about.get("gate") or found
+    name = GATES[first.get("native_int8", False) != found["native_int8"]]
+    write_json(folder / EXPORT_FILE, {**about, name: found})
+    return {"model": card.name, "out": str(folder), **about, "gate": found}
 
 
 def _open_data(card: ModelCard, precision: str, data: Path | None) -> tuple[Dataset, Frames]:

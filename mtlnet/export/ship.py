@@ -20,7 +20,7 @@ from torch import Tensor
 from mtlnet.architecture import HEIGHT, WIDTH
 from mtlnet.evaluation.metrics import GROUPS
 from mtlnet.export.publish import golden_outputs, write_model
-from mtlnet.inference.engine import INT8, Engine, has_openvino, load_engine, read_export
+from mtlnet.inference.engine import GATES, INT8, Engine, has_openvino, load_engine, read_export
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     CARD,
@@ -162,7 +162,9 @@ def write_page(
         tracks=tracks,
         random_roads=len(card.data["tracks"]) - len(tracks),
         notes="" if notes is None else _read_notes(notes),
-        gate=int8.get("gate") if int8.get("model_hash") == card.model_hash else None,
+        gates=[int8[key] for key in GATES if int8.get(key)]
+        if int8.get("model_hash") == card.model_hash
+        else [],
         evaluations=found,
         averaged=any(one.get("views", 1) > 1 for one in found),
         picture=PICTURE if picture is not None else "",

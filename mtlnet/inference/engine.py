@@ -31,6 +31,9 @@ EngineKind = Literal["openvino", "torch"]
 Precision = Literal["bf16", "f32", "int8"]
 EXPORT_FILE = "export.json"
 INT8 = Path("export") / "openvino-int8"
+GATES = ("gate", "other_gate")
+"""Keys in the `export.json` of an int8 graph: the accuracy gate evaluated by the export, and later
+on a processor of the other kind, with or without native int8 (`mtlnet export --gate-only`)."""
 
 
 class Engine(Protocol):
@@ -235,15 +238,18 @@ def uses_int8(run: Path, card: ModelCard) -> bool:
     """Return whether int8 is the default precision of a run on this processor.
 
     True if the run has an int8 graph of the card's weights that passed its accuracy gate
-    (`mtlnet.export.int8`), and the processor multiplies int8 natively. A processor without native
-    int8 can round sums differently. So on this kind of processor int8 is the default only if the
-    gate was also evaluated without native int8.
+    (`mtlnet.export.int8`) on this kind of processor. The kinds are with and without native int8; a
+    processor without native int8 can round sums differently. A graph that was only evaluated
+    without native int8 is also used with native int8.
     """
     about = read_export(run / INT8)
     if about is None or about["model_hash"] != card.model_hash:
         return False
-    gate = about.get("gate") or {}
-    return bool(gate.get("passed")) and (has_int8() or not gate.get("native_int8", False))
+    native = has_int8()
+    gates = [about[key] for key in GATES if about.get(key)]
+    same = [gate for gate in gates if gate.get("native_int8", False) == native]
+    judges = same or [gate for gate in gates if native]
+    return bool(judges) and all(gate.get("passed") for gate in judges)
 
 
 def default_precision(run: Path, card: ModelCard) -> Precision:
