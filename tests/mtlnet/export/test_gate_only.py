@@ -1,4 +1,4 @@
-"""`mtlnet export --gate-only`: the accuracy gate of an int8 graph on the other kind of processor."""
+"""`mtlnet export --gate-only`: the gate of an int8 graph on the other kind of processor."""
 
 import itertools
 import json
