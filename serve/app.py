@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from mtlnet.inference.engine import Engine, view_count
+from mtlnet.inference.engine import Engine, int8_files, view_count
 from runtime.processor import usable_cores
 from serve import problems
 from serve.api import kserve, schemas
@@ -167,8 +167,8 @@ def _add_status(app: FastAPI, frames: FrameHandler) -> None:
         loaded = frame_queue.loaded
         card = asdict(loaded.engine.card, dict_factory=stored)
         known = {name: camera.as_dict() for name, camera in loaded.cameras.items()}
-        views = view_count(loaded.engine)
-        return {**loaded.provenance, **card, "views": views, "cameras": known}
+        engine = {"views": view_count(loaded.engine), "int8_files": int8_files(loaded.engine)}
+        return {**loaded.provenance, **card, **engine, "cameras": known}
 
 
 def _add_metrics(app: FastAPI, service: Service) -> None:

@@ -108,10 +108,10 @@ class ServiceModel:
         card = self._client.model()
         tf.require_version(str(card.get("definitions_version")), f"the service at {url}")
         self.camera: CameraParameters = parse_camera(card.get("camera"))
-        known = ("files", "camera", "engine", "precision", "views")
+        known = ("files", "camera", "engine", "precision", "views", "int8_files")
         self.identity = json.dumps({name: card.get(name) for name in known})
-        """Hashes of the model's files, its camera, and the library, precision and number of views
-        with which the service computes its answers, as JSON."""
+        """Hashes of the model's files, its camera, and the library, precision, number of views and
+        int8 graph with which the service computes its answers, as JSON."""
 
     def predict(self, image: Image) -> dict[str, Any]:
         return self._client.features(encode(image, "jpeg"))  # like the recorded training images

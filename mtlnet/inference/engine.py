@@ -126,6 +126,13 @@ class ViewAverage:
         return mean_outputs(np.stack(found))
 
 
+def int8_files(engine: Engine) -> dict[str, str]:
+    """Return the SHA-256 hashes of the files of the int8 graph with which `engine` computes, by
+    name; empty for another precision."""
+    plain = engine.plain if isinstance(engine, ViewAverage) else engine
+    return dict(getattr(plain, "int8_files", {}))
+
+
 def view_count(engine: Engine) -> int:
     """Return the number of views of each image whose outputs `engine` averages."""
     return engine.views.count if isinstance(engine, ViewAverage) else 1
@@ -147,6 +154,8 @@ class OpenVinoEngine:
         if self.precision == "bf16":
             self.precision = best  # without bf16 in the processor OpenVINO computes in float32
         quantised = self.precision == "int8"
+        export = read_export(run / INT8) if quantised else None
+        self.int8_files: dict[str, str] = {} if export is None else export["files"]
         options = {
             "INFERENCE_PRECISION_HINT": best if quantised else self.precision,
             "INFERENCE_NUM_THREADS": threads,

@@ -109,6 +109,7 @@ def test_the_model_card_is_served(service: Served) -> None:
     assert model["model"] == CARD.model_hash
     assert model["camera"]["fov_y_deg"] == 67.5
     assert model["views"] == 1
+    assert model["int8_files"] == {}
 
 
 def test_the_number_of_views_is_served() -> None:

@@ -1,5 +1,6 @@
 """Sources of perception: parsed and refused predictions, images of the model's camera."""
 
+import hashlib
 import json
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -24,12 +25,14 @@ from mtlnet.inference.engine import INT8, load_engine
 from mtlnet.inference.golden_image import golden_image
 from mtlnet.inference.model_card import (
     GRAPH,
+    GRAPH_WEIGHTS,
     UNCERTAINTY_WEIGHTS,
     WEIGHTS,
     read_card,
     resolve_run,
 )
 from mtlnet.inference.prediction import decode_outputs
+from mtlnet.inference.shipped_models import SHIPPED
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
@@ -153,6 +156,20 @@ def test_the_identity_of_a_service_contains_its_views(
         monkeypatch.setattr(client, "card", {**client.card, "views": views})
         found.add(ServiceModel("http://127.0.0.1:8000").identity)
     assert len(found) == 2
+
+
+def test_the_identity_of_a_service_contains_the_hashes_of_its_int8_graph(
+    client: type[FakeClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for precision in ("int8", "f32"):
+        engine = load_engine(SHIPPED, precision=precision)
+        with serving(engine) as service:
+            monkeypatch.setattr(client, "card", service.ask("GET", "/model").content)
+        found.append(json.loads(ServiceModel("http://127.0.0.1:8000").identity)["int8_files"])
+    graph = SHIPPED / INT8 / GRAPH_WEIGHTS
+    assert found[0][GRAPH_WEIGHTS] == hashlib.sha256(graph.read_bytes()).hexdigest()
+    assert found[1] == {}
 
 
 def test_the_identity_of_a_service_contains_the_hashes_of_the_models_files(
