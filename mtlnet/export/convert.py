@@ -92,11 +92,7 @@ def export_model(
     """
     _require_supported(kind, precision, out, frames)
     if gate_only:
-        if precision != "int8":
-            raise UserError(
-                f"{precision} has no accuracy gate; give --precision int8 or leave out --gate-only"
-            )
-        return evaluate_gate(run, data)
+        return evaluate_gate(run, precision, data)
     card = read_card(run)
     dataset, shown = _open_data(card, precision, data)
     chosen = np.linspace(0, len(shown) - 1, min(frames, len(shown))).astype(np.int64)
@@ -133,13 +129,18 @@ def export_model(
     return {"model": card.name, "out": str(folder), "files": list(names), **about}
 
 
-def evaluate_gate(run: Path, data: Path | None) -> dict[str, Any]:
+def evaluate_gate(run: Path, precision: str, data: Path | None) -> dict[str, Any]:
     """Evaluate the accuracy gate of the int8 graph of `run` again, on this processor and the test
     rounds of the dataset `data` (None: of the training data), and store the result with the graph.
 
     A result of the same kind of processor, with or without native int8, is replaced. Returns the
-    result of `--json`. Raises UserError for missing data, ModelError without an int8 graph.
+    result of `--json`. Raises UserError for another `precision` than int8 and for missing data,
+    ModelError without an int8 graph.
     """
+    if precision != "int8":
+        raise UserError(
+            f"{precision} has no accuracy gate; give --precision int8 or leave out --gate-only"
+        )
     card = read_card(run)
     int8_graph(run, card)
     dataset, _ = _open_data(card, "int8", data)

@@ -134,6 +134,27 @@ def _times_b_transposed(d0: Any, d1: Any, d2: Any, d3: Any, d4: Any) -> Any:
     return first, d3 - d2 - TWO * d1, d3 - THREE * d2 + TWO * d1, slope, d4 - d2 - TWO * slope
 
 
+@compiled_for_threads
+def _set_column(half: Values, j: int, c: int, values: Any) -> None:
+    """Set channel `c` of column `j` of `half` (5, W, C) to five values."""
+    half[0, j, c] = values[0]
+    half[1, j, c] = values[1]
+    half[2, j, c] = values[2]
+    half[3, j, c] = values[3]
+    half[4, j, c] = values[4]
+
+
+@compiled_for_threads
+def _set_products(v: Values, k: int, n: int, t: int, c: int, values: Any) -> None:
+    """Set channel `c` of tile `t` of image `n` in the five elements from `k` on of `v`
+    (25, N, T, C) to five values."""
+    v[k, n, t, c] = values[0]
+    v[k + 1, n, t, c] = values[1]
+    v[k + 2, n, t, c] = values[2]
+    v[k + 3, n, t, c] = values[3]
+    v[k + 4, n, t, c] = values[4]
+
+
 # The transforms process the images from `first` up to `last`. `half` has a tile or window of which
 # the columns are transformed, but not yet the rows.
 
@@ -151,23 +172,13 @@ def _transform_windows(x: Values, first: int, last: int, v: Values) -> None:
                 x0, x1, x2 = x[n, top, left + j], x[n, top + 1, left + j], x[n, top + 2, left + j]
                 x3, x4 = x[n, top + 3, left + j], x[n, top + 4, left + j]
                 for c in range(channels):
-                    d0, d1, d2, d3, d4 = _times_b_transposed(x0[c], x1[c], x2[c], x3[c], x4[c])
-                    half[0, j, c] = d0
-                    half[1, j, c] = d1
-                    half[2, j, c] = d2
-                    half[3, j, c] = d3
-                    half[4, j, c] = d4
+                    d = _times_b_transposed(x0[c], x1[c], x2[c], x3[c], x4[c])
+                    _set_column(half, j, c, d)
             for i in range(WINDOW):
                 row, k = half[i], i * WINDOW
                 for c in range(channels):
-                    d0, d1, d2, d3, d4 = _times_b_transposed(
-                        row[0, c], row[1, c], row[2, c], row[3, c], row[4, c]
-                    )
-                    v[k, n, t, c] = d0
-                    v[k + 1, n, t, c] = d1
-                    v[k + 2, n, t, c] = d2
-                    v[k + 3, n, t, c] = d3
-                    v[k + 4, n, t, c] = d4
+                    d = _times_b_transposed(row[0, c], row[1, c], row[2, c], row[3, c], row[4, c])
+                    _set_products(v, k, n, t, c, d)
 
 
 @compiled_for_threads
@@ -181,21 +192,11 @@ def _transform_tiles(y: Values, first: int, last: int, m: Values) -> None:
             for j in range(TILE):
                 y0, y1, y2 = y[n, top, left + j], y[n, top + 1, left + j], y[n, top + 2, left + j]
                 for c in range(filters):
-                    a0, a1, a2, a3, a4 = _times_a(y0[c], y1[c], y2[c])
-                    half[0, j, c] = a0
-                    half[1, j, c] = a1
-                    half[2, j, c] = a2
-                    half[3, j, c] = a3
-                    half[4, j, c] = a4
+                    _set_column(half, j, c, _times_a(y0[c], y1[c], y2[c]))
             for i in range(WINDOW):
                 row, k = half[i], i * WINDOW
                 for c in range(filters):
-                    a0, a1, a2, a3, a4 = _times_a(row[0, c], row[1, c], row[2, c])
-                    m[k, n, t, c] = a0
-                    m[k + 1, n, t, c] = a1
-                    m[k + 2, n, t, c] = a2
-                    m[k + 3, n, t, c] = a3
-                    m[k + 4, n, t, c] = a4
+                    _set_products(m, k, n, t, c, _times_a(row[0, c], row[1, c], row[2, c]))
 
 
 @compiled_for_threads
@@ -210,12 +211,7 @@ def _add_windows(x: Values, first: int, last: int, v: Values) -> None:
                 v0, v1, v2 = v[j, n, t], v[WINDOW + j, n, t], v[2 * WINDOW + j, n, t]
                 v3, v4 = v[3 * WINDOW + j, n, t], v[4 * WINDOW + j, n, t]
                 for c in range(channels):
-                    b0, b1, b2, b3, b4 = _times_b(v0[c], v1[c], v2[c], v3[c], v4[c])
-                    half[0, j, c] = b0
-                    half[1, j, c] = b1
-                    half[2, j, c] = b2
-                    half[3, j, c] = b3
-                    half[4, j, c] = b4
+                    _set_column(half, j, c, _times_b(v0[c], v1[c], v2[c], v3[c], v4[c]))
             for i in range(WINDOW):
                 row, pixels = half[i], x[n, top + i]
                 for c in range(channels):
