@@ -1,11 +1,16 @@
 """Shared by the tests of collection: runs the command and makes jobs."""
 
+import math
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
+from datagen.execution.process_pool import ProcessPool
+from datagen.execution.retry import Failure, RetryQueue, Timeouts
 from datagen.planning.config import CollectConfig
 from datagen.planning.plan import Plan
 from datagen.planning.planner import make_plan
@@ -34,6 +39,21 @@ def datagen(
 def datagen_here(*args: object) -> subprocess.CompletedProcess[str]:
     """Run the command in this process; for commands that start no other processes."""
     return typed("datagen", *args)
+
+
+@contextmanager
+def recording_here() -> Iterator[None]:
+    """Rounds are recorded in this process; a recording process takes 5 s to start. For tests that
+    are not about these processes."""
+
+    def run(pool: ProcessPool, jobs: Iterable[Job]) -> list[Failure]:
+        queue = RetryQueue(jobs, Timeouts(), pool._on_message)
+        while job := queue.take(math.inf):
+            queue.record_outcome(job, attempt(job, pool._on_message))
+        return queue.failures
+
+    with patch.object(ProcessPool, "run", run):
+        yield
 
 
 def make_small_plan(rounds: int, frames: int) -> Plan:

@@ -4,7 +4,7 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from datagen.recording.mcap.footer import read_summary
 from datagen.recording.mcap.writer import RoundWriter
 from datagen.recording.round_metadata import RoundHeader, RoundResult
 from datagen.recording.splits import Split
-from tests.datagen.commands import ROUNDS, SHORT, datagen, datagen_here
+from tests.datagen.commands import ROUNDS, SHORT, datagen, datagen_here, recording_here
 from trackfeatures.camera import CameraParameters
 
 LANES = 2
@@ -133,9 +133,16 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three rounds of the plan ROUNDS; tests do not change them."""
     folder = tmp_path_factory.mktemp("whole") / "whole"
-    done = datagen_here("collect", *ROUNDS, "--out", folder)
+    with recording_here():
+        done = datagen_here("collect", *ROUNDS, "--out", folder)
     assert done.returncode == 0, done.stderr
     return folder
+
+
+@pytest.fixture
+def recorded_here() -> Iterator[None]:
+    with recording_here():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """Fixtures of the mtlnet tests: a small dataset of drawn roads and a published model."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,13 @@ def short_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     training."""
     monkeypatch.setattr(ood, "FIT", replace(ood.FIT, steps=40))
     monkeypatch.setattr(ood, "PITCH_FRAMES", 8)
+
+
+@pytest.fixture
+def no_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train and publish as on a machine without OpenVINO: converting a network takes 3 s per
+    training. For tests that do not use the graph."""
+    monkeypatch.setitem(sys.modules, "openvino", None)
 
 
 def training_config(dataset: Path, out: Path, **changes: Any) -> TrainConfig:

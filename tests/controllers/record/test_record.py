@@ -31,6 +31,7 @@ from mtlnet.training.sources import recorded_training_data
 from simulator.track.catalogue import find_track
 from simulator.track.road import Road
 from simulator.world.world import World
+from tests.datagen.commands import recording_here
 from tests.typed import typed
 from trackfeatures import RoadClass, UserError
 
@@ -60,7 +61,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
             time.sleep(0.01)
         os.kill(process.pid, signal.SIGKILL)
     assert len(list(out.glob("state/*.json"))) == 1
-    done = record(out)
+    with recording_here():
+        done = record(out)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["recorded_frames"] == 60
     return out

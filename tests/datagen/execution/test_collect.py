@@ -81,6 +81,7 @@ def test_the_same_plan_gives_the_same_bytes_with_another_number_of_workers(
         assert path.read_bytes() == (tmp_path / "again" / "rounds" / path.name).read_bytes()
 
 
+@pytest.mark.usefixtures("recorded_here")
 def test_a_finished_dataset_is_left_alone_and_a_lost_round_made_again(collected: Path) -> None:
     lost = collected / "rounds" / "round-001.mcap"
     kept = collected / "rounds" / "round-000.mcap"
@@ -280,6 +281,7 @@ def test_a_dry_run_prints_the_plan_and_touches_nothing(tmp_path: Path) -> None:
     assert "note: right will be 0% of the train frames and 0% of the test frames" in oval
 
 
+@pytest.mark.usefixtures("recorded_here")
 def test_rounds_of_an_unseen_track_with_jittered_cameras_are_a_dataset_of_their_own(
     tmp_path: Path,
 ) -> None:

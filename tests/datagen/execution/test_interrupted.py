@@ -26,7 +26,13 @@ from datagen.recording.folder import RoundState, read_states
 from datagen.recording.integrity.verify import verify
 from simulator.vehicle.state import Command
 from simulator.world.errors import ContactsUnavailable
-from tests.datagen.commands import attempted, datagen_here, make_jobs, make_small_plan
+from tests.datagen.commands import (
+    attempted,
+    datagen_here,
+    make_jobs,
+    make_small_plan,
+    recording_here,
+)
 from tests.datagen.conftest import Samples
 from trackfeatures.camera import CameraParameters
 
@@ -53,7 +59,8 @@ def test_an_interruption_leaves_whole_rounds_only_and_is_resumed(
     assert len(list(folder.glob("rounds/*"))) == len(kept)
     assert verify(folder, "full").ok
     if number == signal.SIGINT:
-        done = datagen_here(*args, "--out", folder, "--json")
+        with recording_here():
+            done = datagen_here(*args, "--out", folder, "--json")
         assert json.loads(done.stdout)["recorded_frames"] == 60 * (3 - len(kept))
         assert verify(folder, "full").ok
 

@@ -15,6 +15,8 @@ from datagen.recording.integrity.verify import verify
 from datagen.recording.splits import Split, read_split, split_path, write_split
 from tests.datagen.commands import ROUNDS, datagen_here, with_recovered
 
+pytestmark = pytest.mark.usefixtures("recorded_here")
+
 
 def _unfinished(whole: Path, folder: Path) -> Path:
     """A copy of the dataset in which round-002 has never been recorded."""

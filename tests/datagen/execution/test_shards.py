@@ -212,6 +212,7 @@ def test_a_collector_refuses_a_folder_that_another_process_holds(
         assert time.monotonic() < deadline
 
 
+@pytest.mark.usefixtures("recorded_here")
 def test_a_recovered_round_stays_in_a_dataset_that_is_collected_again(
     whole: Path, tmp_path: Path
 ) -> None:

@@ -25,7 +25,7 @@ from datagen.recording.names import PLACED
 from simulator.track.catalogue import find_track
 from simulator.track.geometry import Track
 from simulator.track.road import Road
-from tests.datagen.commands import datagen_here
+from tests.datagen.commands import datagen_here, recording_here
 
 SEED = 5
 
@@ -33,10 +33,11 @@ SEED = 5
 @pytest.fixture(scope="module")
 def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("placed") / "data"
-    done = datagen_here(
-        "collect", "--out", folder, "--poses", PLACED, "--rounds", "2", "--frames", "40",
-        "--tracks", "mountain-pass,random", "--lanes", "2", "--seed", str(SEED),
-    )  # fmt: skip
+    with recording_here():
+        done = datagen_here(
+            "collect", "--out", folder, "--poses", PLACED, "--rounds", "2", "--frames", "40",
+            "--tracks", "mountain-pass,random", "--lanes", "2", "--seed", str(SEED),
+        )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return folder
 

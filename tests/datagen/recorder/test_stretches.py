@@ -42,6 +42,7 @@ def test_no_two_stretches_have_the_same_scenery() -> None:
     assert len({(light.exposure, light.haze_per_km) for _, light, _ in seen}) == 400
 
 
+@pytest.mark.usefixtures("recorded_here")
 def test_scenery_and_light_change_where_a_stretch_ends(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     options = ("--rounds", "1", "--frames", "28", "--tracks", "oval", "--lights", "clear,fog")

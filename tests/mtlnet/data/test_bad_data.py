@@ -26,7 +26,7 @@ from tests.mtlnet.conftest import FRAMES, TRAIN, write_round
 from tests.typed import typed
 from trackfeatures.errors import UserError
 
-pytestmark = pytest.mark.usefixtures("short_fit")
+pytestmark = pytest.mark.usefixtures("short_fit", "no_graph")
 
 
 def damage(folder: Path, name: str, frame: int) -> None:
@@ -63,7 +63,7 @@ def ablation(data: Path, out: Path, **changes: Any) -> None:
 
 
 def judge(published: Path, data: Path, split: str) -> dict[str, Any]:
-    return evaluate([load_engine(published, precision="f32")], data, split)
+    return evaluate([load_engine(published, "torch")], data, split)
 
 
 def test_undecodable_images_are_found_by_round_and_frame(damaged: Path) -> None:

@@ -26,7 +26,7 @@ from mtlnet.training.sources import continue_from_model, custom_training_data, o
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-pytestmark = pytest.mark.usefixtures("short_fit")
+pytestmark = pytest.mark.usefixtures("short_fit", "no_graph")
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_a_model_is_trained_on_with_batch_normalisation(
 def test_images_of_another_camera_are_evaluated_and_trained_on(
     published: Path, custom_images: Path, dataset: Path, tmp_path: Path
 ) -> None:
-    engine = load_engine(published, precision="f32")
+    engine = load_engine(published, "torch")
     plain = evaluate([engine], custom_images, "all")
     assert (plain["frames"], plain["rounds"], plain["split"]) == (6, 0, "all")
     assert plain["mae_m"]["ml"] > 0
@@ -157,7 +157,7 @@ def test_unknown_labels_are_trained_on_and_whole_drives_left_out(
     assert len(card.data["pictures"]) == 2
     weights = load_network(tmp_path / "run" / WEIGHTS).state_dict()
     assert all(bool(torch.isfinite(value).all()) for value in weights.values())
-    found = evaluate([load_engine(tmp_path / "run")], custom_images, "all")
+    found = evaluate([load_engine(tmp_path / "run", "torch")], custom_images, "all")
     assert found["heading_accuracy"] is None
     seen = found["pictures"]["by_training"]
     assert {name: part["cases"] for name, part in seen.items()} == {
@@ -202,7 +202,6 @@ def test_held_out_drives_are_not_converted_and_the_mean_label_is_in_metres_of_th
     assert data.frames.labels.distances[0, :2] == pytest.approx([-1.5, 1.5], abs=1e-3)
 
 
-@pytest.mark.usefixtures("short_fit")
 def test_a_run_with_drives_held_out_continues_on_other_data(
     published: Path, custom_images: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -312,7 +311,7 @@ def test_a_single_image_is_enough(
         (custom_images / f"{number}.png").write_bytes((custom_images / "0.png").read_bytes())
     options = {"data": custom_images, "init": str(published), "iterations": 1, "batch": 1}
     start_training({**options, "device": "cpu", "threads": 1}, tmp_path / "run", resume=False)
-    engine = load_engine(tmp_path / "run")
+    engine = load_engine(tmp_path / "run", "torch")
     found = evaluate([engine], custom_images, "all")
     assert (found["frames"], found["errors"]["ml"]["frames"]) == (count, count)
     [image] = custom_training_data(custom_images, read_card(published).camera).frames.read_batch(

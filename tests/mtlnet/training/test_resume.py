@@ -30,7 +30,7 @@ from tests.mtlnet.conftest import training_config, write_dataset
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
-pytestmark = pytest.mark.usefixtures("short_fit")
+pytestmark = pytest.mark.usefixtures("short_fit", "no_graph")
 
 
 def stop_after(steps: int) -> Callable[..., AbstractContextManager[Callable[[], bool]]]:
