@@ -125,6 +125,7 @@ def test_other_networks_overfit_a_batch(dataset: Path, name: str, steps: int) ->
     assert losses[-1].distance.item() < 0.3 * losses[0].distance.item()
 
 
+@pytest.mark.usefixtures("short_fit")
 def test_another_network_is_trained_published_and_run(dataset: Path, tmp_path: Path) -> None:
     options = {"data": dataset, "network": "mobilenet_v3_small", "iterations": 2, "batch": 4}
     result = start_training({**options, "device": "cpu"}, tmp_path / "run", resume=False)
@@ -147,6 +148,7 @@ def test_a_network_has_a_variant_with_the_other_kind_of_heads() -> None:
         with_heads("mtl", "angle")
 
 
+@pytest.mark.usefixtures("short_fit")
 def test_the_heads_are_chosen_by_an_option(dataset: Path, tmp_path: Path) -> None:
     options = {"data": dataset, "network": "mtl", "iterations": 2, "batch": 4, "device": "cpu"}
     result = start_training({**options, "heads": "bins"}, tmp_path / "run", resume=False)
