@@ -7,6 +7,7 @@ The finished model, with a fitted uncertainty head, is written to the folder of 
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from mtlnet.export.publish import Provenance, export_text, publish
-from mtlnet.inference.model_card import RUNS, ModelCard, read_card
-from mtlnet.model.network import fold
+from mtlnet.inference.model_card import RUNS, WEIGHTS, ModelCard, ModelError, read_card
+from mtlnet.model.network import Network, fold
+from mtlnet.model.pretrained import average_with
 from mtlnet.training.config import TrainConfig
-from mtlnet.training.configure import new_config, newest_run, resume_config
+from mtlnet.training.configure import new_config, newest_run, open_pretrained, resume_config
 from mtlnet.training.distributed import read_rank
 from mtlnet.training.loop import Report, Stopped, TrainProgress
 from mtlnet.training.run import run_training
@@ -142,11 +144,34 @@ def finish(config: TrainConfig, trainer: Trainer, data: TrainingData) -> None:
         seed=config.seed,
         data=data.about,
     )
+    network = fold(trainer.network)
+    if config.init is not None and config.init_share:
+        init = _average_with_init(network, config, config.init, data.about["init"])
+        provenance = replace(provenance, data={**data.about, "init": init})
     uncertainty = fit_uncertainty_head(
-        fold(trainer.network), data.frames, data.held_out, config.seed, data.camera
+        network, data.frames, data.held_out, config.seed, data.camera
     )
-    publish(trainer.network, config.out, images, provenance, uncertainty=uncertainty)
+    publish(network, config.out, images, provenance, uncertainty=uncertainty)
     link_latest(config.out)
+
+
+def _average_with_init(
+    network: Network, config: TrainConfig, name: str, init: dict[str, Any]
+) -> dict[str, Any]:
+    """Average the weights of the trained `network` with those of the model called `name`, from
+    which the training started, and return the card's description of this model.
+
+    `init`: this description as of the start. Raises ModelError when the model has been replaced.
+    """
+    run, card = open_pretrained(name)
+    if card.model_hash != init["model_hash"]:
+        raise ModelError(
+            f"{run} no longer holds the model that {config.out} was started from, so the mean with "
+            "it (--init-share) is not possible; restore the model, or finish without it: "
+            f"`mtlnet train --out {config.out} --resume --init-share 0`"
+        )
+    average_with(network, run / WEIGHTS, config.init_share)
+    return {**init, "share": config.init_share}
 
 
 def link_latest(run: Path) -> None:

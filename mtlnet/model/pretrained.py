@@ -57,6 +57,21 @@ def load_pretrained(
             restore_batch_norm(network, biases, images)
 
 
+def average_with(network: Network, weights: Path, share: float) -> None:
+    """Replace each weight w of `network` by (1 - share) w + share v, where v is the weight of a
+    finished model and `share` is between 0 and 1.
+
+    `network` and the model, whose file is `weights`, have the same architecture, and their batch
+    normalisation is folded. After a training at a low learning rate, the mean of both models
+    usually has lower errors than either of them (Wortsman et al. 2022, "Robust Fine-Tuning of
+    Zero-Shot Models").
+    """
+    model = load_network(weights, network.architecture.name).state_dict()
+    with torch.no_grad():
+        for key, parameter in network.named_parameters():
+            parameter.lerp_(model[key], share)
+
+
 def match_convolutions(old: Architecture, new: Architecture) -> dict[str, str]:
     """Return a dict that maps the submodule name of each convolution of `old` to the name of the
     convolution of `new` that gets its weights.

@@ -101,6 +101,15 @@ class TrainConfig:
             show_default="none: the weights are random at the start",
         ),
     ] = None
+    init_share: Annotated[
+        float,
+        Option(
+            help="Share of the --init model in the result, 0 to less than 1: each weight of the "
+            "result is a weighted mean of the weight before and the weight after the training. "
+            "With recipe tune, 0.5 often lowers the errors and keeps more of what the model could "
+            "do before."
+        ),
+    ] = 0.0
     seed: Annotated[int, Option(help="Seed of all random numbers, 0 or more.")] = 0
     batch: Annotated[
         int,
@@ -165,6 +174,10 @@ class TrainConfig:
                 if self.init is not None
                 else f"recipe {self.recipe} starts from a finished model; give it with --init"
             )
+        if not 0 <= self.init_share < 1:
+            raise UserError(f"--init-share is {self.init_share}; give 0 or more, but less than 1")
+        if self.init_share and self.init is None:
+            raise UserError("--init-share needs a finished model; give it with --init")
         if self.iterations is not None and self.iterations < 1:
             raise UserError(f"--iterations is {self.iterations}; give at least 1")
         if self.minutes is not None and not 0 < self.minutes < math.inf:

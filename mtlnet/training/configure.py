@@ -28,7 +28,7 @@ from runtime.files import write_json
 from trackfeatures.errors import UserError
 
 DATASET = Path("datasets/default")
-RESUMABLE_WITH = ("iterations", "minutes", "device", "threads", "data", "change_data")
+RESUMABLE_WITH = ("iterations", "minutes", "init_share", "device", "threads", "data", "change_data")
 """Fields of TrainConfig that may change when a run is resumed; a change of any other field is
 refused."""
 ABOUT_DATA = ("hold_out_drives", "skip_undecodable")
@@ -123,10 +123,9 @@ def resume_config(run: Path, given: Mapping[str, Any]) -> tuple[TrainConfig, dic
     """Read the stored configuration of a run and change it by the fields `given` on the command
     line; returns the configuration and the description of the data.
 
-    `iterations`, `minutes`, `device`, `threads`, `data` and `change_data` may change. With
-    `change_data`, `hold_out_drives` and `skip_undecodable` may change too; for another folder as
-    `data` they have their defaults unless given. Raises UserError when `given` changes another
-    field.
+    The fields `RESUMABLE_WITH` may change. With `change_data`, `hold_out_drives` and
+    `skip_undecodable` may change too; for another folder as `data` they have their defaults unless
+    given. Raises UserError when `given` changes another field.
     """
     stored, data = read_config(run)
     given = dict(given)

@@ -86,10 +86,10 @@ def _open_data(
     """The data of a run and the model that it starts from; makes the folder of a new run."""
     if resumed is None and rank.is_first:
         require_new(config.out)
-    kept = None if resumed is None else _kept_camera(config, resumed)
+    kept = None if resumed is None or config.init_share else _kept_camera(config, resumed)
     init = None if config.init is None or kept is not None else open_pretrained(config.init)
     data = open_training_data(config, init[1] if init else None, kept, checked=checked)
-    if resumed is not None and list_checkpoints(config.out):
+    if resumed is not None and list_checkpoints(config.out) and not config.init_share:
         init = None  # the checkpoint has replaced the weights of this model
     if resumed is not None:
         data = resume_data(config, data, resumed, init[1] if init else None)

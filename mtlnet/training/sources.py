@@ -77,6 +77,11 @@ def open_training_data(
                 f"--init is a {init.network}, not a {config.network}; leave out --network, or give "
                 "--recipe continue"
             )
+        if config.init_share:
+            raise UserError(
+                f"--init is a {init.network}, not a {config.network}: their weights have no mean; "
+                "leave out --network or --init-share"
+            )
         match_convolutions(find_architecture(init.network), find_architecture(config.network))
     if config.hold_out_drives and not has_labels_file(config.data):
         raise UserError(
@@ -196,14 +201,15 @@ def resume_data(
     description `about` of the result also has an entry for that dataset.
 
     `earlier`: the description of the run's data so far. `start`: the model whose weights the run
-    needs again, because it has no checkpoint. Raises ModelError when `start` is another model than
-    at the first start, when `data` has another camera than the run, or when `data` is another
-    dataset or has another split and `config.change_data` is not set.
+    needs again, because it has no checkpoint or an `init_share`. Raises ModelError when `start` is
+    another model than at the first start, when `data` has another camera than the run, or when
+    `data` is another dataset or has another split and `config.change_data` is not set.
     """
     if start is not None and earlier.get("init") != _origin(start):
+        reason = "was started with --init-share" if config.init_share else "has no checkpoint"
         raise ModelError(
-            f"{config.out} has no checkpoint, and the model {config.init} is not the one it was "
-            "started from; start a new run"
+            f"{config.out} {reason}, and the model {config.init} is not the one it was started "
+            "from; start a new run"
         )
     _require_run_camera(config, earlier, data.camera)
     history = list(earlier.get("earlier", ()))
