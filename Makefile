@@ -100,7 +100,7 @@ check: $(READY) ## format, lint, types, imports, links
 	@$(MAKE) --no-print-directory docs
 
 docs: $(READY) ## build the documentation in build/docs; a broken link fails
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 quick: $(READY) ## the tests that take seconds
 	$(ONE_THREAD) $(BIN)/pytest $(PARALLEL) -m "not slow and not alone and not extended"
