@@ -69,6 +69,25 @@ def test_setup_refuses_a_disk_without_room_before_it_installs_anything(tmp_path:
     assert not environment.exists()
 
 
+@pytest.mark.parametrize("uv_works", [True, False])
+def test_pip_installs_the_lock_if_uv_cannot(uv_works: bool, tmp_path: Path) -> None:
+    put_python(tmp_path, "python3.11", (3, 11))
+    for program in ("grep", "touch"):
+        (tmp_path / program).symlink_to(f"/usr/bin/{program}")
+    put_program(tmp_path / "ldconfig", "echo libEGL.so.1 libGL.so.1 libEGL_nvidia.so.0")
+    log, environment = tmp_path / "log", tmp_path / "environment"
+    (environment / "bin").mkdir(parents=True)
+    put_program(environment / "bin/python", f'echo python "$@" >> {log}')
+    put_program(environment / "bin/uv", f'echo uv "$@" >> {log}; exit {int(not uv_works)}')
+    done = made(tmp_path, f"VENV={environment}", "setup")
+    assert done.returncode == 0, done.stderr
+    assert (environment / ".ready").exists()
+    installs = [line for line in log.read_text().splitlines() if "requirements.lock" in line]
+    assert all("--require-hashes" in line for line in installs)
+    assert [line.split()[0] for line in installs] == (["uv"] if uv_works else ["uv", "python"])
+    assert ("uv could not install requirements.lock" in done.stdout) is not uv_works
+
+
 def test_the_lock_pins_one_version_of_each_package_for_every_python() -> None:
     """Only packages without wheels for a version are left out of it."""
     pins = re.findall(
