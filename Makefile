@@ -89,6 +89,8 @@ compiled: $(READY)
 	@folder=$$(mktemp -d); \
 	$(BIN)/datagen collect --rounds 1 --frames 3 --tracks oval --workers 1 --out $$folder/data \
 	  >/dev/null 2>$$folder/said && $(BIN)/python -c '$(STEP_A_VECTOR)' 2>$$folder/said \
+	  && $(BIN)/controllers compare --controllers lqr,mpc,lqr-kalman,mpc-kalman,rl-residual --tracks oval --steps 5 --disturb \
+	  --out $$folder/drives >/dev/null 2>$$folder/said \
 	  || { cat $$folder/said >&2; exit 1; }; rm -rf $$folder
 
 define STEP_A_VECTOR
