@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 import trackfeatures as tf
 from datagen.recording import Frames
@@ -226,18 +226,20 @@ def fit_std_layers(
     everything = np.arange(len(z))
     # In order, so that a part consists of rounds instead of single frames.
     parts = np.array_split(everything[first_judged:], FOLDS)
+    others = [np.setdiff1d(everything, part) for part in parts]
+    count = min(map(len, others))  # the parts' sizes differ by at most one frame
+    fits = _train(x, scaled, np.stack([rows[:count] for rows in others]), seed)
     log_std = torch.full_like(scaled, torch.nan)
-    for part in parts:
-        others = np.setdiff1d(everything, part)
-        log_std[part] = _train(x[others], scaled[others], seed)(x[part]).detach()
+    for number, part in enumerate(parts):
+        log_std[part] = fits.take(number)(x[part])
     ratio = (scaled / torch.exp(log_std)).abs().numpy()
     temperature = _temperatures(ratio)
-    layers = _train(x, scaled, seed)
+    layers = _train(x, scaled, everything[None], seed).take(0)
     return {
-        "std.first.weight": layers.first.weight.detach().numpy(),
-        "std.first.bias": layers.first.bias.detach().numpy(),
-        "std.second.weight": layers.second.weight.detach().numpy(),
-        "std.second.bias": (layers.second.bias.detach().numpy() + np.log(rms * temperature)).astype(
+        "std.first.weight": layers.first.weight.numpy(),
+        "std.first.bias": layers.first.bias.numpy(),
+        "std.second.weight": layers.second.weight.numpy(),
+        "std.second.bias": (layers.second.bias.numpy() + np.log(rms * temperature)).astype(
             np.float32
         ),
         "low": np.log(rms * MIN_STD_SHARE).astype(np.float32),
@@ -284,32 +286,56 @@ def _temperature(ratio: NDArray[np.float32]) -> float:
     return float(candidates[misses.argmin()])
 
 
-def _train(z: Tensor, error: Tensor, seed: int) -> TwoLayers:
+def _train(z: Tensor, error: Tensor, members: NDArray[np.int64], seed: int) -> "_Fits":
     """Fit layers that compute, from inputs `z` (N, F), the logarithms (N, D) of the scales of the
-    errors' t distributions, by maximum likelihood."""
+    errors' t distributions, by maximum likelihood.
+
+    `members` (K, M): the frames of each of K fits, which are computed together.
+    """
     generator = torch.Generator().manual_seed(seed)
-    layers = _start_layers(z.shape[1], generator)
+    fits = _Fits(len(members), z.shape[1], generator)
     present = (~error.isnan()).float()
     squares = error.nan_to_num() ** 2
+    frames = torch.from_numpy(members)
 
     def loss(rows: Tensor) -> Tensor:
-        log_std = layers(z[rows]).clamp(*LOG_STD_LIMITS)
-        squared_ratio = squares[rows] * torch.exp(-2 * log_std)
+        chosen = frames[:, rows]
+        log_std = fits(z[chosen]).clamp(*LOG_STD_LIMITS)
+        squared_ratio = squares[chosen] * torch.exp(-2 * log_std)
         terms = log_std + 0.5 * (FREEDOM + 1) * torch.log1p(squared_ratio / FREEDOM)
-        mean: Tensor = (terms * present[rows]).mean()
-        return mean
+        total: Tensor = (terms * present[chosen]).mean((1, 2)).sum()
+        return total
 
     # Fewer steps for few frames, against overfitting.
-    settings = replace(FIT, steps=min(FIT.steps, len(z) // 4))
-    minimise(loss, layers.parameters(), len(z), settings, generator)
-    return layers
+    count = members.shape[1]
+    settings = replace(FIT, steps=min(FIT.steps, count // 4))
+    minimise(loss, fits.parameters(), count, settings, generator)
+    return fits
 
 
-def _start_layers(size: int, generator: torch.Generator) -> TwoLayers:
-    """Make two layers whose initial result is 0: the predicted scale is the RMS of the errors."""
-    layers = TwoLayers(size, HIDDEN, len(FEATURES))
-    with torch.no_grad():
-        layers.first.weight.normal_(0.0, size**-0.5, generator=generator)
-        for parameter in (layers.first.bias, layers.second.weight, layers.second.bias):
-            parameter.zero_()
-    return layers
+class _Fits(nn.Module):
+    """K pairs of two layers with a ReLU between them, (K, B, F) -> (K, B, D). Their initial result
+    is 0: the predicted scale is the RMS of the errors."""
+
+    def __init__(self, count: int, size: int, generator: torch.Generator) -> None:
+        super().__init__()
+        first = torch.empty(HIDDEN, size).normal_(0.0, size**-0.5, generator=generator)
+        self.first = nn.Parameter(first.T.repeat(count, 1, 1))
+        self.first_bias = nn.Parameter(torch.zeros(count, 1, HIDDEN))
+        self.second = nn.Parameter(torch.zeros(count, HIDDEN, len(FEATURES)))
+        self.second_bias = nn.Parameter(torch.zeros(count, 1, len(FEATURES)))
+
+    def forward(self, z: Tensor) -> Tensor:
+        hidden = torch.baddbmm(self.first_bias, z, self.first).relu()
+        return torch.baddbmm(self.second_bias, hidden, self.second)
+
+    def take(self, number: int) -> TwoLayers:
+        """Return the layers of one fit."""
+        layers = TwoLayers(self.first.shape[1], HIDDEN, len(FEATURES)).requires_grad_(False)
+        for layer, weight, bias in (
+            (layers.first, self.first, self.first_bias),
+            (layers.second, self.second, self.second_bias),
+        ):
+            layer.weight.copy_(weight[number].detach().T)
+            layer.bias.copy_(bias[number, 0].detach())
+        return layers

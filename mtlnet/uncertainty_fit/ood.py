@@ -213,7 +213,7 @@ def minimise(
     samples. The optimiser is AdamW, with a learning rate that falls to 0 along a cosine.
     """
     optimizer = torch.optim.AdamW(
-        parameters, settings.learning_rate, weight_decay=settings.weight_decay
+        parameters, settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(settings.steps, 1))
     for _ in range(settings.steps):
