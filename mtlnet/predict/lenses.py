@@ -144,6 +144,8 @@ def _failed(name: str, error: Exception, assumed: Lens) -> str:
     reason = str(error).removeprefix(f"{name}: ")
     mount = isinstance(assumed, Rectification)
     what = "the mount of the model's camera" if mount else "the model's own"
+    if isinstance(assumed, float | int):
+        what += f" with a field of view of {assumed:g} deg"
     return f"{name}: no camera found ({reason}); {what} is assumed; --camera gives another"
 
 

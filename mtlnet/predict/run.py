@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any, Self
 
@@ -58,7 +59,8 @@ def predict_files(
     that a recording states (with `stated`) or that is estimated, else the model's. `report`: called
     with the numbers of images done and in total. `note`: called with a line about files left out
     and cameras found. `topic`: topic to read from recordings; empty: the only topic with pictures.
-    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends streams.
+    `calibrate`: estimate the camera of films and streams from their pictures. Ctrl-C ends a stream;
+    before the first stream begins, it raises KeyboardInterrupt.
 
     Raises InputsLeftOut, after all other images are done, when an input or an image could not be
     used; UserError at once for an invalid `lens`, and for outputs that cannot be written, are
@@ -77,6 +79,10 @@ def predict_files(
     sources = [
         with_lens(s, camera, lens, note, calibrate=calibrate, stated=stated) for s in sources
     ]
+    live = [source.name for source in usable if source.kind is SourceKind.STREAM]
+    for before, later in pairwise(live):
+        note(f"{later} is read when {before} has ended; to read both now, use two commands")
+    before_live = sum(s.count for s in takewhile(lambda s: s.name not in live[:1], usable))
     answers = _Answers(engine, sum(source.count for source in sources), report)
     fps = usable[0].fps if usable else DEFAULT_FPS
 
@@ -92,10 +98,12 @@ def predict_files(
             for item in items:
                 answers.add(item, writing)
         except KeyboardInterrupt:
-            if not any(source.kind is SourceKind.STREAM for source in usable):
+            if not live or answers.used < before_live:
                 raise
             note(f"stopped after {answers.used} images")
     _report_streams(sources, answers, note)
+    if answers.used > KEPT_ROWS and not outputs:
+        note(f"{answers.used} images done, the result has the first {KEPT_ROWS}; --out has all")
     return answers.finish()
 
 

@@ -24,12 +24,14 @@ from mtlnet.data.labels_file import LABELS
 from mtlnet.inference.overlay import draw_overlay
 from mtlnet.inference.prediction import Prediction
 from mtlnet.sources.read import SourceImage
+from runtime.files import atomic_write
 from runtime.film import FILM_SUFFIX, Mp4Writer
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
 MCAP_SUFFIX = ".mcap"
 TABLE_SUFFIXES = (".csv", ".jsonl")
+FILE_SUFFIXES = (*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX)
 TEXT_HEIGHT = 64
 """Height of the text with the features below a picture, px."""
 TEXT_COLOUR = (235, 235, 235)
@@ -54,9 +56,9 @@ class Writer(Protocol):
 def check_output(path: Path) -> None:
     """Raise UserError if `open_writer` cannot write to `path`: for an unknown suffix, a parent
     folder that does not exist, a folder instead of a file, or a file instead of a folder."""
-    kind = path.suffix.lower()
-    if kind not in (*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX, ""):
-        kinds = ", ".join((*TABLE_SUFFIXES, FILM_SUFFIX, MCAP_SUFFIX))
+    kind = _kind(path)
+    if kind not in (*FILE_SUFFIXES, ""):
+        kinds = ", ".join(FILE_SUFFIXES)
         raise UserError(f"--out {path}: give a file ending in {kinds}, or a folder for pictures")
     if not path.parent.is_dir():
         raise UserError(f"--out {path}: there is no folder {path.parent}; make it first")
@@ -66,6 +68,13 @@ def check_output(path: Path) -> None:
         raise UserError(f"--out {path} is a file; give a folder for pictures")
 
 
+def _kind(path: Path) -> str:
+    """Return the suffix of an output in lower case; empty for a folder of pictures, which may have
+    a dot in its name if it exists."""
+    suffix = path.suffix.lower()
+    return "" if suffix not in FILE_SUFFIXES and path.is_dir() else suffix
+
+
 def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
     """Open the writer for the suffix of `path`, which empties a file that exists; a path without a
     suffix is a folder of pictures. Call `check_outputs` first.
@@ -73,7 +82,7 @@ def open_writer(path: Path, camera: CameraParameters, fps: float) -> Writer:
     `camera`: the model's camera, in whose view pictures are drawn. `fps`: frames per second of a
     film or recording. Raises OSError if the file cannot be opened.
     """
-    kind = path.suffix.lower()
+    kind = _kind(path)
     if kind in TABLE_SUFFIXES:
         return TableWriter(path)
     if kind == MCAP_SUFFIX:
@@ -205,7 +214,7 @@ class PictureWriter:
         frame = [] if item.frame is None else [str(item.frame)]
         name = "-".join((f"{self._count:04d}", stem, *frame))
         # Not written by OpenCV, which needs UTF-8 names and does not report why it fails.
-        (self._folder / f"{name}.png").write_bytes(encode(picture, "png"))
+        atomic_write(self._folder / f"{name}.png", encode(picture, "png"))
         self._count += 1
 
     def __enter__(self) -> Self:

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -47,13 +46,14 @@ def shown_name(given: str) -> str:
         return f"webcam {given}"
     if not ADDRESS.match(given):
         return given
-    try:
-        parts = urlsplit(given)
-    except ValueError:  # such as brackets that do not match
-        return given.rpartition("@")[2]
-    if "@" not in parts.netloc:
-        return given
-    return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
+    scheme, _, rest = given.partition("://")
+    host = re.split("[/?#]", rest, maxsplit=1)[0]
+    _, colon, port = host.rpartition(":")
+    if "@" in host:
+        rest = rest[host.rindex("@") + 1 :]
+    elif colon and not port.isdecimal():  # a password with / ? or #, not written as %2F %3F %23
+        rest = rest.rpartition("@")[2]
+    return f"{scheme}://{rest}"
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """The files of `mtlnet predict`: tables, films and pictures, also when writing fails."""
 
 import csv
+import errno
 import json
 import os
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 import trackfeatures as tf
+from mtlnet.predict import run
 from mtlnet.predict.run import InputsLeftOut, predict_files
 from mtlnet.predict.writers import TEXT_HEIGHT
 from mtlnet.sources.films import read_film_header
@@ -103,6 +105,33 @@ def test_a_full_disk_keeps_what_is_done_and_is_told(
         with pytest.raises(OSError, match="No space left") as raised:
             predict_files(engine, [str(image)], [tmp_path / name])
         assert raised.value.filename == str(tmp_path / name)
+
+
+def test_a_full_disk_leaves_no_broken_picture(engine: BrightnessEngine, tmp_path: Path) -> None:
+    image, folder = write_jpeg(tmp_path / "a.jpg", 10), tmp_path / "drawn.2026"
+    folder.mkdir()  # a folder may have a dot in its name
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        mock.patch("pathlib.Path.replace", side_effect=full),
+        pytest.raises(OSError, match="No space") as raised,
+    ):
+        predict_files(engine, [str(image)], [folder])
+    assert str(folder) in str(raised.value.filename)
+    assert not list(folder.iterdir())
+    predict_files(engine, [str(image)], [folder])
+    assert [path.name for path in folder.iterdir()] == ["0000-a.png"]
+
+
+def test_a_result_that_is_cut_is_announced(
+    engine: BrightnessEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "KEPT_ROWS", 3)
+    film, notes = str(write_film(tmp_path / "in.mp4", [30] * 5)), list[str]()
+    assert len(predict_files(engine, [film], note=notes.append)) == 3
+    assert "5 images done, the result has the first 3; --out has all" in notes
+    notes.clear()
+    predict_files(engine, [film], [tmp_path / "rows.csv"], note=notes.append)
+    assert not any("the first 3" in line for line in notes)
 
 
 def test_nothing_is_written_after_an_error(engine: BrightnessEngine, tmp_path: Path) -> None:

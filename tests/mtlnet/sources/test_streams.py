@@ -12,6 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from unittest.mock import Mock, patch
 
+import cv2
 import numpy as np
 import pytest
 import simplejpeg
@@ -113,7 +114,7 @@ def test_a_stream_that_fails_keeps_its_answers(
         ("20241128120000", "webcam 20241128120000 is no webcam; give its number"),
         ("/dev/video-front", "/dev/video-front is no webcam"),
         ("/dev/video0/x", "/dev/video0/x is no webcam"),
-        ("rtsp://me:word@[::1/x", r"^\[::1/x cannot be opened as a stream"),
+        ("rtsp://me:word@[::1/x", r"^rtsp://\[::1/x cannot be opened as a stream"),
         ("a" * 300, "there is no image file a+|cannot be read .File name too long"),
     ],
 )
@@ -158,6 +159,38 @@ def test_ctrl_c_ends_a_stream_and_keeps_its_answers(engine: BrightnessEngine, ad
     rows = predict_files(engine, [f"{address}/end"], report=interrupt, note=notes.append)
     assert len(rows) == 3
     assert notes == ["stopped after 3 images"]
+
+
+@pytest.mark.parametrize("at", [3, 8])
+def test_ctrl_c_in_a_film_before_a_stream_is_an_interruption(
+    at: int, engine: BrightnessEngine, address: str, tmp_path: Path
+) -> None:
+    film = cv2.VideoWriter(
+        str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (280, 210)
+    )
+    for _ in range(5):
+        film.write(np.zeros((210, 280, 3), np.uint8))
+    film.release()
+
+    def interrupt(done: int, total: int) -> None:
+        if done == at:
+            raise KeyboardInterrupt
+
+    inputs = [str(tmp_path / "a.avi"), f"{address}/end"]
+    if at <= 5:
+        with pytest.raises(KeyboardInterrupt):
+            predict_files(engine, inputs, report=interrupt)
+    else:
+        assert len(predict_files(engine, inputs, report=interrupt)) == at - 1
+
+
+def test_of_two_streams_the_second_is_announced(engine: BrightnessEngine, address: str) -> None:
+    notes: list[str] = []
+    rows = predict_files(engine, [f"{address}/end", f"{address}/end?2"], note=notes.append)
+    assert len(rows) == 2 * COUNT
+    assert notes[0] == (
+        f"{address}/end?2 is read when {address}/end has ended; to read both now, use two commands"
+    )
 
 
 @pytest.mark.parametrize("count", [4, 100])  # 4: the fault is known, but its item is still waiting
@@ -218,4 +251,9 @@ def test_a_file_comes_before_a_webcam(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not is_live("0")
     assert [is_live(name) for name in ("a.mp4", "/dev/video2", "RTSP://a/b")] == [False, True, True]
     assert shown_name("rtsp://me:word@10.0.0.2:554/a?b=1") == "rtsp://10.0.0.2:554/a?b=1"
-    assert not re.search("word", shown_name("rtsp://me:wo@rd@10.0.0.2/a"))
+    for plain in ("rtsp://10.0.0.2/a?b", "http://cam:80/a@1", "http://cam/a@1", "rtsp://[::1]:5/a"):
+        assert shown_name(plain) == plain
+    for odd in "@/?#[":
+        shown = shown_name(f"rtsp://me:wo{odd}rd@10.0.0.2/a")
+        assert not re.search(r"wo|rd|me", shown), shown
+        assert shown.endswith("10.0.0.2/a")
