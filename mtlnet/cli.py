@@ -183,9 +183,13 @@ def evaluate_command(
 
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
-    engines = [
-        _load(model, engine, precision, gpu=True, views=views) for _ in range(os.cpu_count() or 1)
-    ]
+    # On a GPU these threads decode images for one engine.
+    engines = [_load(model, engine, precision, gpu=True, views=views)]
+    for _ in range(1, os.cpu_count() or 1):
+        shared = getattr(engines[0], "on_gpu", False)
+        engines.append(
+            engines[0] if shared else _load(model, engine, precision, gpu=True, views=views)
+        )
     with command.progress("evaluating") as report:
         if protocol:
             result = evaluate_protocol(engines, data, protocol, report, every)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.gpu.plan import Size
-from benchmarks.gpu.process import Command, Ended
+from benchmarks.gpu.process import Command, Ended, log_tail
 from datagen.recording import Dataset, DatasetError
 
 SEEDS = {"test": 3601, "unseen": 3602, "random": 3603, "train": 3610}
@@ -105,15 +105,23 @@ def counted(folder: Path, collections: list[Collection], ended: list[Ended]) -> 
 
     `whole_frames_per_second` is the number of frames divided by the time from the start of the
     calls of `datagen collect` to the end of the last call, including planning. `frames_per_second`
-    is the sum of the recording speeds that the calls print, None if a call was stopped.
+    is the sum of the recording speeds that the calls print, None if a call was stopped or lost
+    rounds.
     """
     frames = {each.name: finished_frames(folder / each.name) for each in collections}
     seconds = max(end.seconds for end in ended)
     stopped = any(end.stopped for end in ended)
+    incomplete = {
+        each.name: log_tail(folder / f"{each.name}.log").splitlines()[-1:]
+        for each, end in zip(collections, ended, strict=True)
+        if end.code and not end.stopped
+    }
     return {
         "frames": frames,
+        "collecting_seconds": seconds,
+        "incomplete": incomplete,
         "frames_per_second": None
-        if stopped
+        if stopped or incomplete
         else round(sum(_speed(folder, each) for each in collections), 1),
         "whole_frames_per_second": round(sum(frames.values()) / seconds, 1),
         "recording_was_stopped": stopped,

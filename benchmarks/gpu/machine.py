@@ -9,6 +9,7 @@ import os
 import platform
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ from benchmarks.gpu.wheels import ROOT, missing_packages
 TORCS_TRACK = "g-track-3"
 SOFTWARE = ("llvmpipe", "softpipe", "swrast")
 ASK_S = 120.0
+NVIDIA_EGL = Path("/usr/local/nvidia/share/glvnd/egl_vendor.d/10_nvidia.json")
+"""Description of NVIDIA's EGL driver in containers whose driver files are mounted there, where EGL
+does not look by itself."""
 
 GPU_QUESTION = """
 import json, torch
@@ -55,12 +59,10 @@ def describe_machine() -> dict[str, Any]:
         "torcs": False,
         "errors": {},
     }
-    for name, question in (
-        ("gpu", GPU_QUESTION),
-        ("egl", EGL_QUESTION),
-        ("tracks", TRACKS_QUESTION),
-    ):
-        answer = ask(question)
+    questions = {"gpu": GPU_QUESTION, "egl": EGL_QUESTION, "tracks": TRACKS_QUESTION}
+    with ThreadPoolExecutor(len(questions)) as pool:
+        answers = list(pool.map(ask, questions.values()))
+    for name, answer in zip(questions, answers, strict=True):
         if isinstance(answer, str):
             found["errors"][name] = answer
         else:
@@ -120,8 +122,11 @@ def missing_at_all(*, gpu: bool = True) -> tuple[dict[str, Any], list[str]]:
 
 
 def set_paths(site: Path, tracks: Path | None) -> None:
-    """Set the environment variables PYTHONPATH and TORCS_TRACKS for the commands of a run."""
+    """Set the environment variables PYTHONPATH and TORCS_TRACKS for the commands of a run, and the
+    driver of EGL if NVIDIA's is where containers have it."""
     paths = [str(ROOT), str(site), os.environ.get("PYTHONPATH", "")]
     os.environ["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
     if tracks is not None:
         os.environ["TORCS_TRACKS"] = str(tracks.resolve())
+    if NVIDIA_EGL.is_file():
+        os.environ.setdefault("__EGL_VENDOR_LIBRARY_FILENAMES", str(NVIDIA_EGL))

@@ -17,8 +17,10 @@ from typing import Any
 
 from benchmarks.gpu.collecting import (
     VARIED,
+    Collection,
     counted,
     evaluation_collections,
+    finished_frames,
     most_frames,
     train_collections,
 )
@@ -29,7 +31,7 @@ from benchmarks.gpu.wheels import ROOT
 from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.model_card import CARD
 
-MERGE_SHARE = 0.12
+MERGE_SHARE, LEAST_MERGE_S = 0.12, 30.0
 """Share of the time of the stage `collect_train` that is kept for merging its parts."""
 START_S = 12.0
 """Seconds that a collection needs for imports and planning before it records, in a run of ten
@@ -140,8 +142,8 @@ def collect_test(task: Run) -> dict[str, Any]:
     collections = evaluation_collections(task.size, task.cores)
     commands = [each.command(task.work) for each in collections]
     ended = run(commands, task.left())
-    _require_not_failed(commands, ended)
     found = counted(task.work, collections, ended)
+    require_recorded(collections, commands, ended, found)
     if not found["frames"]["test"]:
         raise StageFailed("no round was finished in time", found)
     return found
@@ -153,21 +155,27 @@ def collect_train(task: Run) -> dict[str, Any]:
     if "train_frames" not in task.report.content:  # a continued run keeps its plans
         most = most_frames(task.size, task.report.content["machine"]["gpu_bytes"])
         before = task.report.stage("collect_test")
-        speed = before["frames_per_second"] or before["whole_frames_per_second"]
-        fitting = int(speed * (seconds - START_S * task.plan.scale))
+        start = START_S * task.plan.scale
+        speed = before["frames_per_second"]
+        if speed is None:  # the whole time includes the start
+            whole_s = before["collecting_seconds"]
+            speed = sum(before["frames"].values()) / max(whole_s - start, 0.2 * whole_s)
+        fitting = int(speed * (seconds - start))
         task.report.save(train_frames=max(min(most, fitting), 1))
     frames = task.report.content["train_frames"]
     collections = train_collections(task.size, task.cores, frames)
     commands = [each.command(task.work) for each in collections]
     ended = run(commands, seconds)
-    _require_not_failed(commands, ended)
     found = counted(task.work, collections, ended)
+    require_recorded(collections, commands, ended, found)
     parts = [str(task.work / name) for name, frames in found["frames"].items() if frames]
     if not parts:
         raise StageFailed("no round was finished in time", found)
     merge = task.command("merge", "-m", "datagen", "merge", *parts, "--out", str(_train_set(task)))
-    (merged,) = run([merge], task.left())
-    _require_ended(merge, merged, found)
+    (merged,) = run([merge], max(task.left(), LEAST_MERGE_S * task.plan.scale))
+    found["merged_frames"] = finished_frames(_train_set(task))
+    if not (merged.stopped and found["merged_frames"]):  # a part of the rounds can be trained on
+        _require_ended(merge, merged, found)
     return found
 
 
@@ -236,7 +244,7 @@ def train(task: Run) -> dict[str, Any]:
     """Train the model: recipe `fast` from new weights, or `continue` from the shipped weights."""
     folder = task.work / "train"
     points = read_curves(folder / CURVES)
-    frames = sum(task.report.stage("collect_train").get("frames", {}).values())
+    frames = task.report.stage("collect_train").get("merged_frames", 0)
     now = time.monotonic() - task.begin
     minutes = task.plan.train_minutes(now, frames)
     before = points[-1]["elapsed_s"] / 60.0 if points else 0.0
@@ -334,11 +342,18 @@ def _model(task: Run) -> Path:
     return task.work / "model"
 
 
-def _require_not_failed(commands: list[Command], ended: list[Ended]) -> None:
-    """Raise StageFailed if a command that was not stopped ended with an error."""
-    for command, end in zip(commands, ended, strict=True):
-        if not end.stopped:
-            _require_ended(command, end)
+def require_recorded(
+    collections: list[Collection],
+    commands: list[Command],
+    ended: list[Ended],
+    found: dict[str, Any],
+) -> None:
+    """Raise StageFailed if a collection ended with an error and without a finished round. A
+    collection that lost only some of its rounds, for example because a car touched a wall where
+    PyBullet is missing, is used."""
+    for each, command, end in zip(collections, commands, ended, strict=True):
+        if not end.stopped and not found["frames"][each.name]:
+            _require_ended(command, end, found)
 
 
 def _require_ended(command: Command, ended: Ended, found: dict[str, Any] | None = None) -> None:

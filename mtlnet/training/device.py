@@ -31,6 +31,9 @@ def choose_device(name: str, rank: Rank = SINGLE_PROCESS) -> torch.device:
         raise UserError(f"--device {name}: torch finds no GPU on this machine; use --device cpu")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise UserError(f"--device {name}: torch finds {torch.cuda.device_count()} GPU(s)")
+    if device.type == "cuda":
+        # TF32, torch's default for convolutions in float32, rounds their inputs to 10 bits.
+        torch.backends.cudnn.allow_tf32 = False
     return device
 
 

@@ -88,8 +88,9 @@ def train_loop(
                 require_finite(window[-1:], trainer.step_number)
             if trainer.step_number % LOG_EVERY == 0:
                 now = time.perf_counter()
-                require_finite(window, trainer.step_number)
-                means = torch.stack(window).double().mean(0).cpu().numpy()
+                rows = torch.stack(window).double().cpu()  # the only wait for a GPU
+                require_finite(rows.unbind(), trainer.step_number)
+                means = rows.mean(0).numpy()
                 speed = len(window) * config.batch / (now - logged)
                 window, logged = [], now
                 progress = TrainProgress(trainer.step_number, fraction, now - begin, speed, means)

@@ -63,6 +63,7 @@ def _run_torch(
     """Return the same arrays as `_run_openvino`, computed by torch in float32, on a GPU if there is
     one."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    torch.backends.cudnn.allow_tf32 = False  # TF32, the default, rounds to 10 bits
     module = FitInputs(copy.deepcopy(network)).eval().to(device)
     images = np.empty((CHUNK, HEIGHT, WIDTH, 3), np.uint8)
     parts: list[tuple[Tensor, Tensor, Tensor]] = []

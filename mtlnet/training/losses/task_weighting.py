@@ -71,7 +71,8 @@ class TaskWeighting:
         """Return the factor of each task's loss term at this step; 0 for a task that is not
         learned."""
         if self.method != "uncertainty":
-            return [float(weight) for weight in self.weights]
+            weights: list[float] = self.weights.tolist()  # one copy from a GPU, not three
+            return weights
         factors = torch.tensor(LIKELIHOOD_FACTORS)
         learned = factors * torch.exp(-self.log_variance.cpu()) * self.learned.cpu()
         return [float(weight) for weight in learned]

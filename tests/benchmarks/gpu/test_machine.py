@@ -103,6 +103,11 @@ def test_wheels_are_downloaded_for_the_machine_and_may_not_be_too_large(
 def test_a_machine_that_lacks_something_starts_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    driver = tmp_path / "10_nvidia.json"
+    driver.touch()
+    monkeypatch.setattr(machine, "NVIDIA_EGL", driver)
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "")
+    monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES")
     for name in ("PYTHONPATH", "TORCS_TRACKS"):  # which are set for the commands of a run
         monkeypatch.setenv(name, "before")
     found = {**GOOD, "gpu": None, "torcs": False}
@@ -118,6 +123,7 @@ def test_a_machine_that_lacks_something_starts_nothing(
     assert [line.split(":")[0] for line in lacks] == ["  tracks", "  gpu"]
     assert not (tmp_path / "out").exists()
     assert os.environ["TORCS_TRACKS"] == str(tmp_path)
+    assert os.environ["__EGL_VENDOR_LIBRARY_FILENAMES"] == str(driver)
     assert os.environ["PYTHONPATH"].split(os.pathsep) == [
         *(str(ROOT), str(tmp_path / "work" / "site"), "before"),
     ]

@@ -14,10 +14,11 @@ from benchmarks.gpu.collecting import (
     train_collections,
 )
 from benchmarks.gpu.plan import FULL, REHEARSAL, SECONDS, STAGES, Plan
-from benchmarks.gpu.process import Ended
+from benchmarks.gpu.process import GRACE_S, Ended
 from mtlnet.inference.model_card import read_card
 from mtlnet.inference.shipped_models import SHIPPED
 from mtlnet.inference.trained_rounds import Seeds
+from tests.mtlnet.conftest import write_dataset
 from trackfeatures.errors import UserError
 
 
@@ -26,9 +27,10 @@ def test_deadlines_are_shares_of_the_minutes() -> None:
     assert sum(SECONDS.values()) == 600.0
     deadlines = [plan.deadline(stage) for stage in STAGES]
     assert all(a < b for a, b in pairwise(deadlines))
-    assert deadlines[-1] == 595.0  # five seconds are left to end
+    # A command that is stopped has 12 s to save its work, and 6 s are left to end.
+    assert 600.0 - deadlines[-1] == GRACE_S + 6.0
     assert (plan.deadline("forward"), plan.deadline("fast"), plan.deadline("train")) == (
-        *(30.0, 245.0, 460.0),
+        *(30.0, 245.0, 447.0),
     )
     assert [Plan(3.0).deadline(stage) for stage in STAGES] == pytest.approx(
         [0.3 * deadline for deadline in deadlines]
@@ -42,9 +44,9 @@ def test_deadlines_are_shares_of_the_minutes() -> None:
 def test_the_training_takes_what_its_start_and_end_and_the_earlier_stages_leave() -> None:
     plan = Plan(10.0)
     on_time = plan.train_minutes(245.0, 60_000)
-    assert on_time == pytest.approx((215 - 12 - 50 - 10) / 60)
+    assert on_time == pytest.approx((202 - 12 - 50 - 10) / 60)
     assert plan.train_minutes(185.0, 60_000) == pytest.approx(on_time + 1.0)
-    assert plan.train_minutes(245.0, 10**7) == pytest.approx(0.25 * 215 / 60)
+    assert plan.train_minutes(245.0, 10**7) == pytest.approx(0.25 * 202 / 60)
     assert plan.train_minutes(594.5, 0) == pytest.approx(1 / 60)
 
 
@@ -52,10 +54,10 @@ def test_a_stage_that_begins_late_has_its_own_time_until_the_run_ends() -> None:
     plan = Plan(10.0)
     assert plan.seconds("forward", 10.0) == 20.0  # five seconds were left before it
     assert plan.seconds("forward", 60.0) == 15.0
-    assert plan.seconds("train", 300.0) == 160.0
-    assert plan.seconds("train", 450.0) == 0.25 * 215.0
-    assert plan.seconds("paper", 500.0) == 95.0
-    assert plan.seconds("paper", 560.0) == 35.0
+    assert plan.seconds("train", 300.0) == 147.0
+    assert plan.seconds("train", 450.0) == 0.25 * 202.0
+    assert plan.seconds("paper", 500.0) == 82.0
+    assert plan.seconds("paper", 560.0) == 22.0
     assert plan.seconds("paper", 600.0) == 0.0
 
 
@@ -92,7 +94,31 @@ def test_collections_that_were_stopped_count_their_finished_rounds(tmp_path: Pat
     found = counted(tmp_path, [part], [Ended(130, True, 2.0)])
     assert found == {
         "frames": {"part0": 0},
+        "collecting_seconds": 2.0,
+        "incomplete": {},
         "frames_per_second": None,
         "whole_frames_per_second": 0.0,
         "recording_was_stopped": True,
     }
+
+
+def test_a_collection_that_lost_rounds_is_used_and_one_without_rounds_fails(
+    tmp_path: Path,
+) -> None:
+    """A collection without PyBullet loses the rounds in which a car touched something."""
+    whole, empty = train_collections(REHEARSAL, 2, 8)[:2]
+    (tmp_path / whole.name).mkdir()
+    write_dataset(tmp_path / whole.name)
+    for each in (whole, empty):
+        (tmp_path / f"{each.name}.log").write_text(
+            "error: round r3 failed: contacts need PyBullet\n"
+        )
+    ended = [Ended(1, False, 4.0), Ended(1, False, 2.0)]
+    commands = [each.command(tmp_path) for each in (whole, empty)]
+    found = counted(tmp_path, [whole, empty], ended)
+    assert found["frames"][whole.name] > 0
+    assert found["frames_per_second"] is None
+    assert found["incomplete"][whole.name] == ["error: round r3 failed: contacts need PyBullet"]
+    stages.require_recorded([whole], commands[:1], ended[:1], found)
+    with pytest.raises(stages.StageFailed, match="contacts need PyBullet"):
+        stages.require_recorded([whole, empty], commands, ended, found)
