@@ -48,7 +48,7 @@ def build(
     # One strip contains both sides; the quads between left and right side have no area.
     left, right = grids
     bridge = np.stack([left[-1], right[0]])
-    bridge[:, :, :3] = right[0, 0, :3]
+    bridge[0, :, :3], bridge[1, :, :3] = left[-1, 0, :3], right[0, 0, :3]
     vertices = np.concatenate([left, bridge, right])
     ends = np.stack([profiles[0][-1], profiles[1][0]]) + 1e6
     length = mesh.s[-1]
