@@ -7,6 +7,7 @@ whole coordinates, so a centred principal point is ((width - 1) / 2, (height - 1
 
 from dataclasses import asdict, dataclass, fields, replace
 from math import atan, degrees, isfinite, radians, tan
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from trackfeatures.errors import UserError
@@ -60,6 +61,14 @@ class CameraParameters:
     """Height of the car's centre of gravity above the road, m."""
 
     def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            pixels = getattr(self, name)
+            if not isinstance(pixels, Integral) or pixels < 1:
+                raise CameraError(f"the {name} of a camera is {pixels!r}; give whole px above 0")
+        for name in ("x", "y", "z", "pitch_deg", "roll_deg", "yaw_deg"):
+            value = getattr(self, name)
+            if not isinstance(value, Real) or not isfinite(value):
+                raise CameraError(f"{name} of a camera is {value!r}; give a finite number")
         if self.matrix is not None:
             matrix = _numbers("matrix", self.matrix, (4,))
             if min(matrix[:2]) <= 0:
@@ -77,7 +86,7 @@ class CameraParameters:
         coefficients = _numbers(f"{self.distortion} distortion", self.coefficients, counts)
         object.__setattr__(self, "coefficients", coefficients)
         lo, hi = FOV_LIMITS_DEG
-        if not lo <= self.fov_y_deg <= hi:
+        if not isinstance(self.fov_y_deg, Real) or not lo <= self.fov_y_deg <= hi:
             raise CameraError(
                 f"vertical field of view {self.fov_y_deg} deg; give a value between {lo:g} and "
                 f"{hi:g} deg"

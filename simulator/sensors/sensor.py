@@ -87,10 +87,11 @@ class Sensor:
         if isinstance(exact, np.ndarray):
             return self.limit(exact, rng)
         value = float(exact)
+        # Drawn for an invalid reading too: the noise depends only on the number of readings.
+        noise = 0.0 if rng is None else rng.normal(0.0, self.noise)
         if value == self.invalid:
             return value
-        if rng is not None:
-            value += rng.normal(0.0, self.noise)
+        value += noise
         if np.dtype(self.dtype).kind in "iu":
             value = float(np.rint(value))
         return min(max(value, self.limits[0]), self.limits[1])

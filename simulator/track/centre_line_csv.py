@@ -75,7 +75,12 @@ def _read_points(path: Path) -> tuple[FloatArray, float]:
     """Return the points (N, 2) of the closed line, each once, and the track's width (m)."""
     rows = _read_rows(path)
     widths = rows[:, 2] + rows[:, 3]
-    if not (rows[:, 2:] > 0.0).all() or not WIDTH_M[0] <= float(np.median(widths)) <= WIDTH_M[1]:
+    if not (rows[:, 2:] > 0.0).all():
+        raise TrackError(
+            f"{path}: a width to one side of the centre line is {rows[:, 2:].min():g} m; "
+            "the widths to both sides must be above 0"
+        )
+    if not WIDTH_M[0] <= float(np.median(widths)) <= WIDTH_M[1]:
         raise TrackError(
             f"{path}: widths from {widths.min():g} to {widths.max():g} m, "
             f"expected {WIDTH_M[0]:g} to {WIDTH_M[1]:g} m"

@@ -1,6 +1,6 @@
 """Reads the project's own track format, a TOML list of straights and bends.
 
-    name, look, surface, width (m), vertical_curve (m, at most the lap)
+    look, surface, width (m), vertical_curve (m, at most the lap)
     [markings]   the fields of `MarkingStyle`
     [[segment]]  type = "straight", length (m)
     [[segment]]  type = "bend", radius (m), angle (deg, left positive, spirals included),
@@ -83,7 +83,10 @@ class Table:
 
 def read_toml_track(path: Path) -> Track:
     """Read the track of one TOML file, named after the file. Raises TrackError if it is bad."""
-    return build_track(Table(_load(path), str(path)), readable_name(path.stem))
+    try:
+        return build_track(Table(_load(path), str(path)), readable_name(path.stem))
+    except ValueError as error:  # a message with an integer of thousands of hexadecimal digits
+        raise TrackError(f"{path}: {error}") from None
 
 
 def build_track(table: Table, name: str) -> Track:

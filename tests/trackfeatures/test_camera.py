@@ -1,6 +1,7 @@
 """Camera parameters: pinhole matrix, height above the road, refused values, stored form."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,21 @@ def test_intrinsics_of_a_lens_of_90_degrees() -> None:
 
 def test_the_default_camera_is_1_20_m_above_the_road() -> None:
     assert CameraParameters().height_above_road_m == pytest.approx(1.20)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *({name: value} for name in ("width", "height") for value in (0, -5, 280.5, "280")),
+        *({name: float("nan")} for name in ("x", "y", "z", "pitch_deg", "roll_deg", "yaw_deg")),
+        *({"z": value} for value in (float("inf"), "a", None)),
+        {"fov_y_deg": "a"},
+    ],
+)
+def test_sizes_and_mounts_that_are_no_numbers_are_refused(values: dict[str, Any]) -> None:
+    (name,) = values
+    with pytest.raises(UserError, match="vertical field of view" if name == "fov_y_deg" else name):
+        CameraParameters(**values)
 
 
 @pytest.mark.parametrize("fov_y_deg", [0.0, -20.0, 180.0, float("nan")])

@@ -77,7 +77,8 @@ void main() {
 #ifdef LABELS
     // The class at the pixel's centre: classes cannot be blended.
 #ifdef VARIED
-    bool painted = paint_of_lines(s, y, 1e-4, 1e-4, number).a > 0.5 && gap < 0.5;
+    // The length of the footprint is above the spacing of float32 at the end of a long lap.
+    bool painted = paint_of_lines(s, y, 0.02, 1e-4, number).a > 0.5 && gap < 0.5;
 #else
     bool painted = abs(y - line_y) < left_line.w && gap < 0.5;
     if (divider && fract(s / dashes.y) * dashes.y > dashes.x) painted = false;

@@ -104,7 +104,10 @@ def _number_in(text: str) -> float:
     if found is None:
         return math.nan
     digits = found[1]
-    return float(int(digits, 16)) if digits[:2] in ("0x", "0X") else float(digits)
+    try:
+        return float(int(digits, 16)) if digits[:2] in ("0x", "0X") else float(digits)
+    except OverflowError:  # a hexadecimal number beyond the largest float
+        return math.inf
 
 
 def read_parameter_file(path: Path) -> Section:

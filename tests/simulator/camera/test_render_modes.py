@@ -15,6 +15,8 @@ from simulator.camera.snapshot import CLASS_COLOURS, colourise, standing_pose, w
 from simulator.track.catalogue import find_track
 from simulator.track.markings import MarkingStyle
 from simulator.track.road import Road
+from simulator.varied.carriageway import Carriageway
+from simulator.varied.look import RoadLook
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -298,3 +300,14 @@ def test_a_contact_sheet_of_one_view_and_kind(road: Road, tmp_path: Path) -> Non
     known = (sheets[0][:, :, None] == palette).all(axis=-1).any(axis=-1)
     assert known.mean() > 0.98
     assert (sheets[0] != sheets[1]).any(axis=-1).mean() > 0.1
+
+
+def test_the_lines_of_a_varied_road_have_their_class_to_the_end_of_a_long_lap() -> None:
+    """Distances along the lap are float32 in the shader: beyond 1 km their spacing is 0.1 mm."""
+    road = Road.varied(find_track("highway"), Carriageway.drawn(3, 2))
+    counts = {}
+    with Camera(road, seed=3, light=light(), look=RoadLook(), scenes=1) as camera:
+        for s in (400.0, 1300.0, 3000.0):
+            kind = camera.render_views(standing_pose(road, s, 0.0), views=("front:class",))
+            counts[s] = int((kind["front:class"] == MARKING).sum())
+    assert min(counts[1300.0], counts[3000.0]) > 0.6 * counts[400.0] > 0

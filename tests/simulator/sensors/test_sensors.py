@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import simulator.env  # noqa: F401 registers the environments
 from simulator.camera import Camera, Light
 from simulator.sensors.beams import BEAM_ANGLES, RANGE_M, shorten_at_boxes, track_beams
 from simulator.sensors.sensor import Sensor, SensorSuite
@@ -234,6 +235,19 @@ def test_noise_keeps_limits_and_the_off_track_value() -> None:
         while not world.step(Command(steer=1.0, throttle=1.0)).off_track:
             pass
         np.testing.assert_array_equal(suite.read(world)["range"], np.full(19, -1.0))
+
+
+def test_the_noise_of_a_scalar_does_not_depend_on_earlier_invalid_readings() -> None:
+    def read(values: list[float]) -> list[float]:
+        left = iter(values)
+        sensor = Sensor(
+            "a", "m", lambda _: next(left), limits=(0.0, 99.0), noise=1.0, invalid=-99.0
+        )
+        rng = np.random.default_rng(3)
+        return [float(sensor.measure(None, rng)) for _ in values]  # type: ignore[arg-type]
+
+    whole, broken = read([5.0, 5.0, 5.0]), read([5.0, -99.0, 5.0])
+    assert broken == [whole[0], -99.0, whole[2]]
 
 
 def test_bad_sensors_are_refused() -> None:

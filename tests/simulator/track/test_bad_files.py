@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,12 @@ def test_named_pipes_are_skipped(tmp_path: Path) -> None:
     for name in ("flat.csv", "deep/deep.xml"):
         os.mkfifo(tmp_path / name)
     assert not {"flat", "deep"} & set(track_files(tmp_path))
+
+
+def test_a_number_beyond_all_floats_is_refused_and_the_listing_goes_on(tmp_path: Path) -> None:
+    huge = "0x" + "f" * 300
+    with_huge = re.sub('(name="width" val=")[^"]*', rf"\g<1>{huge}", STADIUM, count=1)
+    assert with_huge != STADIUM
+    assert refused(tmp_path / "huge.xml", with_huge)
+    list_tracks(tmp_path)  # skips it
+    assert refused(tmp_path / "long.toml", "width = 0x" + "f" * 6000)

@@ -128,3 +128,10 @@ def test_errors_name_the_fault(tmp_path: Path, lines: list[str], said: str) -> N
     with pytest.raises(TrackError, match=r"bad\.csv") as caught:
         read_track(path)
     assert said in str(caught.value)
+
+
+def test_a_width_of_zero_to_one_side_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "ring.csv"
+    path.write_text(HEADER + "\n".join(row.replace(",5.5,", ",0,") for row in circle()) + "\n")
+    with pytest.raises(TrackError, match="a width to one side of the centre line is 0 m"):
+        read_track(path)
