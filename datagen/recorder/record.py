@@ -162,7 +162,7 @@ class FrameTruth:
     def render(self, camera: Camera) -> NDArray[np.uint8]:
         """Render the image of the frame, (height, width, 3) uint8 RGB."""
         camera.change_scene(*self.scenery)
-        return camera.render(self.pose, self.frame.traffic)
+        return camera.render(self.pose, self.frame.traffic, near_s=self.frame.place.s)
 
 
 def record_round(
@@ -287,7 +287,7 @@ def _next_frame(
         ),
         ego=EgoState(
             **{name: getattr(now, name) for name in EGO_NAMES},
-            shadow_fraction=camera.shadow_fraction(pose),
+            shadow_fraction=camera.shadow_fraction(pose, now.s),
         ),
         command=DriverCommand(command.steer, command.throttle, command.brake, command.gear),
         sensors=_readings(suite.read(world)),

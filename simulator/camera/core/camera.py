@@ -147,14 +147,22 @@ class Camera:
         )
 
     def render(
-        self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
+        self,
+        body_pose: ArrayLike,
+        others: ArrayLike | None = None,
+        view: str = "front",
+        *,
+        near_s: float | None = None,
     ) -> Picture:
         """Draw `view`, one of VIEWS, from a car at `body_pose`; returns (height, width, 3) uint8
         RGB.
 
         `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity (m, rad). `others`
-        (n, 6) are the poses of other cars, with z on the ground below each car.
+        (n, 6) are the poses of other cars, with z on the ground below each car. `near_s`: as in
+        `render_views`; it is needed where a car jumps from place to place.
         """
+        if near_s is not None:
+            self._last_s = near_s
         return self._views(body_pose, others, {view: ViewRequest(view)})[view]
 
     def render_views(
@@ -274,9 +282,11 @@ class Camera:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def shadow_fraction(self, body_pose: ArrayLike) -> float:
+    def shadow_fraction(self, body_pose: ArrayLike, near_s: float | None = None) -> float:
         """Return the share (0 to 1) of the asphalt up to 30 m ahead of the car that is in hard
-        shadow."""
+        shadow. `near_s`: as in `render_views`."""
+        if near_s is not None:
+            self._last_s = near_s
         pose = np.asarray(body_pose, dtype=np.float64)
         s = self._s_of(float(pose[0]), float(pose[1]))
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)

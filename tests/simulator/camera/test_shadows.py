@@ -181,3 +181,19 @@ def test_bridge_shadows_match_ray_tracing(name: str, seed: int) -> None:
     assert dark > 15
     # Railings are drawn but cast no shadow.
     assert np.mean(agreed) > 0.93
+
+
+def test_the_shadow_share_of_a_car_that_jumps_is_that_of_its_place() -> None:
+    """Two parts of the road lie 36 m apart, so that the last place is no hint for the next one."""
+    road = Road(find_track("random:3"), 2)
+    light = Light.named("heavy-shadow", np.random.default_rng(1))
+    before, after = standing_pose(road, 463.0, 1.5), standing_pose(road, 517.0, 1.5)
+    with (
+        Camera(road, CameraParameters(), seed=3, light=light) as fresh,
+        Camera(road, CameraParameters(), seed=3, light=light) as jumping,
+    ):
+        expected = fresh.shadow_fraction(after)
+        jumping.shadow_fraction(before, 463.0)
+        assert jumping.shadow_fraction(after, 517.0) == expected
+        jumping.render(before, near_s=463.0)
+        assert np.array_equal(jumping.render(after, near_s=517.0), fresh.render(after))
