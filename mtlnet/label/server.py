@@ -31,6 +31,7 @@ from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelChangedError, LabelFolder, heading_of, row_version
 from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
 from runtime.access import HostNames
+from runtime.cli import describe
 from runtime.files import locked_folder, name_as_text
 from runtime.sockets import address, bind_all
 from trackfeatures.camera import CameraParameters
@@ -260,13 +261,20 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
 
 
 def _answer_errors(app: FastAPI, folder: Path) -> None:
-    """Make `app` answer a UserError and a faulty request with one line of text, `detail`. The line
-    names files without the path of `folder` on this machine."""
+    """Make `app` answer a UserError, an OSError and a faulty request with one line of text,
+    `detail`. The line names files without the path of `folder` on this machine."""
+
+    def short(text: str) -> str:
+        return name_as_text(text.replace(f"{folder}/", ""))
 
     @app.exception_handler(UserError)
     async def refuse(_request: Any, error: UserError) -> Response:
         status = 409 if isinstance(error, LabelChangedError) else 422
-        return _refused(status, name_as_text(str(error).replace(f"{folder}/", "")))
+        return _refused(status, short(str(error)))
+
+    @app.exception_handler(OSError)
+    async def report(_request: Any, error: OSError) -> Response:
+        return _refused(500, short(describe(error)))
 
     @app.exception_handler(RequestValidationError)
     async def refuse_form(_request: Any, error: RequestValidationError) -> Response:
