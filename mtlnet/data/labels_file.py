@@ -157,6 +157,15 @@ def write_cells(path: Path, rows: list[Cells]) -> None:
     atomic_write(path, text.getvalue().encode("utf-8", "surrogateescape"), fsync=True)
 
 
+def check_name(name: str) -> None:
+    """Raise UserError if `read_cells` would not return the file name `name` as it was written."""
+    if name != name.strip() or "\r" in name:
+        raise UserError(
+            f"the file name {name!r} cannot be written to {LABELS}: rename the file, without "
+            "spaces at the ends of its name and without carriage returns"
+        )
+
+
 def check_cells(cells: Cells) -> None:
     """Raise UserError with the reason if `cells`, a row that is to be written, is faulty."""
     try:

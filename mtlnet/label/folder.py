@@ -16,6 +16,7 @@ from mtlnet.data.labels_file import (
     UNKNOWN,
     Cells,
     check_cells,
+    check_name,
     lane_cells,
     lane_sides,
     read_cells,
@@ -50,8 +51,9 @@ class LabelFolder:
         `camera_file`: camera of the pictures whose row names no camera; the file is copied into a
         folder that has no camera file. `model`: camera of the model, whose values replace values
         that are missing in a camera file. Raises UserError for a folder without pictures; for a
-        folder without a camera file in which no row names a camera; for a faulty `labels.csv`; and
-        for a camera file that differs from the file in the folder.
+        picture whose name cannot be written to `labels.csv`; for a folder without a camera file in
+        which no row names a camera; for a faulty `labels.csv`; and for a camera file that differs
+        from the file in the folder.
         """
         if not folder.is_dir():
             raise UserError(f"there is no folder {folder}; give one with pictures")
@@ -64,6 +66,8 @@ class LabelFolder:
         self.files = self._find()
         if not self.files:
             raise UserError(f"there is no picture in {folder}")
+        for name in self.files:
+            check_name(name)
         self.rows()  # raises for a faulty file before labelling starts
         own = self.folder / CAMERA_FILE
         if camera_file is not None:

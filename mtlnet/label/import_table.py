@@ -24,6 +24,7 @@ from mtlnet.data.labels_file import (
     UNKNOWN,
     Cells,
     check_cells,
+    check_name,
     lane_cells,
     path_within,
     write_cells,
@@ -158,6 +159,7 @@ def _converted(
     Raises UserError or ValueError."""
     if not path_within(row["file"]):
         raise UserError(f"the file {row['file']!r} is not a path inside the table's folder")
+    check_name(row["file"])
     height, width = read_whole_image(folder / row["file"]).shape[:2]
     camera = CameraParameters(
         width=width,

@@ -2,12 +2,16 @@
 
 import errno
 import os
+from pathlib import Path
 from unittest import mock
 
 import pytest
 
-from tests.mtlnet.label.conftest import Site
+from mtlnet.label.folder import LabelFolder
+from tests.mtlnet.label.conftest import TRUE, Site
 from tests.mtlnet.label.test_server import LABEL
+from trackfeatures.camera import CameraParameters
+from trackfeatures.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -27,3 +31,22 @@ def test_a_label_that_cannot_be_written_is_one_line(
     assert (status, told["detail"][: len(detail)]) == (500, detail)
     assert "Traceback" not in capfd.readouterr().err
     assert site.ask("PUT", "/api/pictures/0/label", LABEL)[0] == 200
+
+
+@pytest.mark.parametrize("name", [" 1.png", "\xa01.png", "\x851.png", "1\r.png", "\tsub/1.png"])
+def test_a_name_that_cannot_be_written_is_refused(pictures: Path, name: str) -> None:
+    (pictures / name).parent.mkdir(exist_ok=True)
+    (pictures / "1.png").rename(pictures / name)
+    with pytest.raises(UserError, match=r"the file name .* cannot be written") as seen:
+        LabelFolder(pictures, None, CameraParameters())
+    assert repr(name) in str(seen.value)
+
+
+def test_a_name_with_other_special_characters_is_read_as_it_was_written(pictures: Path) -> None:
+    for number, name in enumerate(("a b.png", "a\xa0b.png", 'a",b.png', "a\nb.png", "a\xff.png")):
+        (pictures / name).write_bytes((pictures / "1.png").read_bytes())
+        folder = LabelFolder(pictures, None, CameraParameters())
+        for _ in range(2):
+            folder.save(folder.files.index(name), TRUE, "", {})
+        assert len(folder.rows()) == number + 1
+        assert folder.rows()[name]["file"] == name

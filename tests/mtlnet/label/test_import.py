@@ -95,6 +95,7 @@ def test_an_imported_folder_opens_after_a_label_was_removed(tmp_path: Path) -> N
     [
         ("a.png,x,-1.9,0,40,1.22", "line 2: x_left_m is 'x', not a number"),
         ("../a.png,1.7,-1.9,0,40,1.22", r"line 2: the file '\.\./a\.png' is not a path"),
+        (" a.png,1.7,-1.9,0,40,1.22", "line 2: the file name ' a.png' cannot be written"),
         ("c.png,1.7,-1.9,0,40,1.22", r"line 2: there is no image file .*c\.png"),
         ("a.png,1.7,-7,0,40,1.22", "line 2: mr is 7 m; it must be from 0.5 to 5.5"),
         ("a.png,1.7,-1.9,2,40,1.22", "line 2: angle is 2; it must be within 0.5 rad"),
