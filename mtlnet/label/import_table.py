@@ -26,6 +26,7 @@ from mtlnet.data.labels_file import (
     check_cells,
     check_name,
     lane_cells,
+    normal_name,
     path_within,
     write_cells,
 )
@@ -124,7 +125,8 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
     """Read the table; returns, for each row, the line number and the cells by column. Raises
     UserError for a faulty header, a faulty row and a repeated file.
 
-    Bytes that are not UTF-8 become surrogates, as in file names.
+    File names are normalized (`normal_name`). Bytes that are not UTF-8 become surrogates, as in
+    file names.
     """
     lines: dict[str, int] = {}
     rows: list[tuple[int, dict[str, str]]] = []
@@ -141,6 +143,7 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
                 where = f"{table}, line {reader.line_num}"
                 if None in row or None in row.values():
                     raise UserError(f"{where}: it does not have {len(names)} values")
+                row["file"] = normal_name(row["file"])
                 first = lines.setdefault(row["file"], reader.line_num)
                 if first != reader.line_num:
                     raise UserError(f"{where}: {row['file']} stands in line {first} already")

@@ -50,3 +50,11 @@ def test_a_name_with_other_special_characters_is_read_as_it_was_written(pictures
             folder.save(folder.files.index(name), TRUE, "", {})
         assert len(folder.rows()) == number + 1
         assert folder.rows()[name]["file"] == name
+
+
+def test_the_label_of_a_name_with_a_dot_belongs_to_the_picture(site: Site) -> None:
+    table = site.folder / "labels.csv"
+    table.write_text("file,ml,mr,l,m,r,angle,heading\n./1.png,-1,2.6,,,,0,?\n")
+    assert site.ask("GET", "/api/pictures")[1]["pictures"][0]["labelled"] is True
+    assert site.ask("PUT", "/api/pictures/0/label", LABEL)[0] == 200
+    assert [line.split(",")[0] for line in table.read_text().splitlines()] == ["file", "1.png"]

@@ -104,6 +104,7 @@ def test_an_imported_folder_opens_after_a_label_was_removed(tmp_path: Path) -> N
         ("a.png,1.7,-1.9,0,40,1.22,9", "line 2: it does not have 6 values"),
         ('a.png,"1.7"x,-1.9,0,40,1.22', "after line 1: ',' expected after"),
         (f"{ROW}\nb.png,1.7,-1.9,0,40,1.22\n{ROW}", r"line 4: a\.png stands in line 2 already"),
+        (f"{ROW}\n./{ROW}", r"line 3: a\.png stands in line 2 already"),
         ("b.png,1.7,-1.9,0,40,1.22\n../x.png,1.7,-1.9,0,40,1.22", "line 3: the file"),
     ],
 )
