@@ -294,14 +294,10 @@ def _checked(app: Asgi, names: HostNames, token: str | None) -> Asgi:
     """Return `app` with a check of every request before it (`_refusal`)."""
 
     async def run(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http":
-            refusal = _refusal(scope, names, token)
-            if refusal is not None:
-                await refusal(scope, receive, send)
-                return
-        elif scope["type"] != "lifespan":
+        if scope["type"] != "http":
             return  # there is no WebSocket: uvicorn answers 403
-        await app(scope, receive, send)
+        answer = _refusal(scope, names, token) or app
+        await answer(scope, receive, send)
 
     return run
 
@@ -347,5 +343,8 @@ def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) ->
             f"{len(labeller.folder.files)} pictures; open {where}/{hint} and end with Ctrl-C\n"
         )
         sys.stderr.flush()
-        config = uvicorn.Config(app, log_level="warning", access_log=False, ws="none")
+        # A lifespan task that a second signal cancels would print a traceback.
+        config = uvicorn.Config(
+            app, log_level="warning", access_log=False, ws="none", lifespan="off"
+        )
         uvicorn.Server(config).run(sockets=listeners)

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,7 +61,8 @@ def test_a_picture_begins_with_the_models_answer(pictures: Path) -> None:
     assert "the image shows" in narrow["note"]
 
 
-def test_the_command_serves_and_ends_with_ctrl_c(pictures: Path) -> None:
+@pytest.mark.parametrize("names", ["SIGINT", "SIGTERM", "SIGHUP", "SIGINT SIGINT"])
+def test_the_command_serves_and_ends_with_a_signal(pictures: Path, names: str) -> None:
     command = [sys.executable, "-m", "mtlnet", "label", str(pictures), "--no-model", "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -71,8 +73,12 @@ def test_the_command_serves_and_ends_with_ctrl_c(pictures: Path) -> None:
             assert Site(pictures, int(found[1])).ask("GET", "/api/pictures")[0] == 200
             assert "another process is writing to" in refused("label", pictures, "--no-model")
         finally:
-            process.send_signal(signal.SIGINT)
-    assert process.returncode in (0, 130)
+            for name in names.split():
+                process.send_signal(signal.Signals[name])
+                time.sleep(0.02)  # so that two signals are not one
+        rest = process.stderr.read()
+    assert process.returncode in (0, 130), rest
+    assert "Traceback" not in rest
 
 
 def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
