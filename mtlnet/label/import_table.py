@@ -11,7 +11,6 @@ ignored. The cameras are pinholes.
 import csv
 import filecmp
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -32,6 +31,7 @@ from mtlnet.data.labels_file import (
 )
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from runtime.camera_file import write_camera
+from runtime.files import atomic_write
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 from trackfeatures.road_class import BEND_CURVATURE
@@ -107,7 +107,7 @@ def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> d
         source, target = table.parent / cells["file"], folder / cells["file"]
         if not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+            atomic_write(target, source.read_bytes())
         if camera not in cameras:
             cameras[camera] = _write_camera(folder, camera, pitches[camera])
         cells["camera"] = cameras[camera]
@@ -163,13 +163,16 @@ def _converted(
     if not path_within(row["file"]):
         raise UserError(f"the file {row['file']!r} is not a path inside the table's folder")
     check_name(row["file"])
+    camera_height_m = _number(row, "camera_height_m")
+    if camera_height_m <= 0:
+        raise UserError(f"camera_height_m is {camera_height_m:g}; it must be above 0")
     height, width = read_whole_image(folder / row["file"]).shape[:2]
     camera = CameraParameters(
         width=width,
         height=height,
         fov_y_deg=_number(row, "fov_y_deg"),
         x=0.0,
-        z=_number(row, "camera_height_m") - CameraParameters.cg_height_m,
+        z=camera_height_m - CameraParameters.cg_height_m,
     )
     curvature = _number(row, "curvature_1pm") if row.get("curvature_1pm") else 0.0
     bend = "left" if curvature > 0 else "right"
