@@ -85,9 +85,28 @@ def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
     seen = refused("label", pictures, "--no-model", "--host", "0.0.0.0")
     assert "--host 0.0.0.0 can be reached from other machines: set a token" in seen
     assert "--label-std belongs to --import" in refused("label", pictures, "--label-std", "1,1")
+    assert "--json belongs to --import" in refused("label", tmp_path / "none", "--json")
     both = refused("label", pictures, "--import", "table.csv", "--camera", "camera.yaml")
     assert "--import takes the cameras from its table; leave --camera out" in both
     assert "there is no folder" in refused("label", tmp_path / "none", "--no-model")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--host", "127.0.0.1"), "--host"),
+        (("--port", "8010"), "--port"),
+        (("--token-file", "token"), "--token-file"),
+        (("--insecure", "--no-model", "--model", "default"), "--model, --no-model, --insecure"),
+    ],
+)
+def test_options_of_the_page_are_refused_with_import(
+    tmp_path: Path, options: tuple[str, ...], named: str
+) -> None:
+    path = table(tmp_path / "theirs", "a.png,1.7,-1.9,0.03,40,1.22", head=HEAD)
+    seen = refused("label", tmp_path / "mine", "--import", path, *options)
+    assert seen == f"error: --import does not open the page; leave {named} out"
+    assert not (tmp_path / "mine").exists()
 
 
 def test_a_table_is_imported_by_the_command(tmp_path: Path) -> None:
