@@ -309,7 +309,9 @@ def label_command(
     from mtlnet.label.server import Labeller, serve_folder
 
     known = read_card(resolve_run(model)).camera
-    opened = LabelFolder(folder, camera, known)
+    opened = LabelFolder(
+        folder, camera, known, lambda line: typer.echo(command.printable(line), err=True)
+    )
     engine = None if no_model else _load(model, "openvino", None)
     serve_folder(Labeller(opened, engine), host, port, token)
 

@@ -19,9 +19,10 @@ import trackfeatures as tf
 from mtlnet.data.labels_file import read_labels
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.server import Labeller
+from runtime.files import locked_folder
 from tests.mtlnet.label.conftest import Site
 from tests.mtlnet.label.test_import import HEAD, table
-from tests.mtlnet.test_cli import refused
+from tests.mtlnet.test_cli import mtlnet, refused
 from tests.typed import typed
 from trackfeatures.camera import CameraParameters
 
@@ -79,6 +80,24 @@ def test_the_command_serves_and_ends_with_a_signal(pictures: Path, names: str) -
         rest = process.stderr.read()
     assert process.returncode in (0, 130), rest
     assert "Traceback" not in rest
+
+
+def test_the_assumed_mount_of_a_camera_file_is_printed(pictures: Path) -> None:
+    (pictures / "camera.yaml").unlink()
+    camera = pictures.parent / "ros.yaml"
+    matrix = "[500, 0, 320, 0, 500, 180, 0, 0, 1]"
+    camera.write_text(
+        f"{{image_width: 640, image_height: 360, camera_matrix: {{data: {matrix}}}, "
+        "distortion_model: plumb_bob, distortion_coefficients: {data: [0, 0, 0, 0, 0]}}\n"
+    )
+    with locked_folder(pictures):  # the command ends when it has read the camera
+        done = mtlnet("label", pictures, "--no-model", "--camera", camera)
+    note, error = done.stderr.splitlines()
+    assert note.startswith(
+        f"{camera}: a calibration of OpenCV or ROS; no mount is given, so 1.2 m above the road and "
+        "pitch 0 deg are assumed"
+    )
+    assert "another process is writing to" in error
 
 
 def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
