@@ -278,6 +278,7 @@ def calibrate_command(config: CalibrateConfig, as_json: command.AsJson = False) 
 
 @app.command("label")
 def label_command(
+    context: typer.Context,
     folder: options.LabelFolderName,
     camera: options.LabelCamera = None,
     model: options.Model = "default",
@@ -296,17 +297,15 @@ def label_command(
     With --import: convert a table of labels and copy its pictures to FOLDER, without the browser.
     """
     from mtlnet.label.import_table import import_labels, parse_label_std
+    from mtlnet.label.options import check_options
     from runtime.access import check_exposure, read_token
 
+    check_options(context)
     if table is not None:
-        if camera is not None:
-            raise UserError("--import takes the cameras from its table; leave --camera out")
         found = import_labels(table, folder, parse_label_std(label_std or ()))
         told = f"{found['pictures']} pictures of {found['cameras']} cameras in {folder}"
         command.print_result(found, as_json, f"{told}; `mtlnet evaluate --data {folder}`")
         return
-    if label_std:
-        raise UserError("--label-std belongs to --import; give both, or none")
     token = read_token(token_file)
     check_exposure(host, token, insecure)
     from mtlnet.inference.model_card import read_card, resolve_run
@@ -314,7 +313,9 @@ def label_command(
     from mtlnet.label.server import Labeller, serve_folder
 
     known = read_card(resolve_run(model)).camera
-    opened = LabelFolder(folder, camera, known)
+    opened = LabelFolder(
+        folder, camera, known, lambda line: typer.echo(command.printable(line), err=True)
+    )
     engine = None if no_model else _load(model, "openvino", None)
     serve_folder(Labeller(opened, engine), host, port, token)
 

@@ -115,7 +115,7 @@ def read_labels(path: Path) -> tuple[list[LabelledPicture], CustomLabels]:
 
 def read_cells(path: Path) -> list[tuple[int, Cells]]:
     """Read a `labels.csv`; returns, for each row, the line number and the cells by column, without
-    surrounding spaces.
+    surrounding spaces. File names are normalized (`normal_name`).
 
     Raises UserError for a wrong header, a row with missing or surplus cells, and a repeated file.
     """
@@ -133,7 +133,7 @@ def read_cells(path: Path) -> list[tuple[int, Cells]]:
                         f"{path}, line {reader.line_num}: it has not {len(names)} values"
                     )
                 cells = {name: text.strip() for name, text in row.items()}
-                name = cells["file"]
+                name = cells["file"] = normal_name(cells["file"])
                 if name in seen:
                     raise UserError(
                         f"{path}, line {reader.line_num}: {name} stands in line {seen[name]} "
@@ -155,6 +155,20 @@ def write_cells(path: Path, rows: list[Cells]) -> None:
     writer.writeheader()
     writer.writerows({name: row.get(name, "") for name in (*COLUMNS, *used)} for row in rows)
     atomic_write(path, text.getvalue().encode("utf-8", "surrogateescape"), fsync=True)
+
+
+def normal_name(name: str) -> str:
+    """Return the shortest path that is written like `name`, `b.jpg` for `./b.jpg`; "" for ""."""
+    return str(PurePosixPath(name)) if name else name
+
+
+def check_name(name: str) -> None:
+    """Raise UserError if `read_cells` would not return the file name `name` as it was written."""
+    if name != name.strip() or "\r" in name:
+        raise UserError(
+            f"the file name {name!r} cannot be written to {LABELS}: rename the file, without "
+            "spaces at the ends of its name and without carriage returns"
+        )
 
 
 def check_cells(cells: Cells) -> None:

@@ -16,6 +16,7 @@ from mtlnet.data.labels_file import (
     UNKNOWN,
     Cells,
     check_cells,
+    check_name,
     lane_cells,
     lane_sides,
     read_cells,
@@ -25,7 +26,7 @@ from mtlnet.inference.image_decoding.decode import read_whole_image
 from mtlnet.inference.rectification import CAMERA_FILE, TOLERANCE, read_camera
 from mtlnet.label.geometry import Markings
 from mtlnet.sources.kinds import SourceKind, kind_of
-from runtime.camera_file import write_camera
+from runtime.camera_file import Note, write_camera
 from runtime.files import natural_key
 from trackfeatures.camera import CameraParameters
 from trackfeatures.definitions import MARKINGS
@@ -44,14 +45,22 @@ class LabelFolder:
     """A folder with pictures to label. A picture is addressed by its index in the list `files`,
     which does not change."""
 
-    def __init__(self, folder: Path, camera_file: Path | None, model: CameraParameters) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        camera_file: Path | None,
+        model: CameraParameters,
+        note: Note | None = None,
+    ) -> None:
         """Find the pictures in `folder` and its subfolders, and check `labels.csv`.
 
         `camera_file`: camera of the pictures whose row names no camera; the file is copied into a
         folder that has no camera file. `model`: camera of the model, whose values replace values
-        that are missing in a camera file. Raises UserError for a folder without pictures; for a
-        folder without a camera file in which no row names a camera; for a faulty `labels.csv`; and
-        for a camera file that differs from the file in the folder.
+        that are missing in a camera file. `note` is called with a line about the values that were
+        chosen or assumed for `camera_file`. Raises UserError for a folder without pictures; for a
+        picture whose name cannot be written to `labels.csv`; for a folder without a camera file in
+        which no row names a camera; for a faulty `labels.csv`; and for a camera file that differs
+        from the file in the folder.
         """
         if not folder.is_dir():
             raise UserError(f"there is no folder {folder}; give one with pictures")
@@ -64,10 +73,12 @@ class LabelFolder:
         self.files = self._find()
         if not self.files:
             raise UserError(f"there is no picture in {folder}")
+        for name in self.files:
+            check_name(name)
         self.rows()  # raises for a faulty file before labelling starts
         own = self.folder / CAMERA_FILE
         if camera_file is not None:
-            camera = read_camera(camera_file, model)
+            camera = read_camera(camera_file, model, note)
             if own.exists() and read_camera(own, model) != camera:
                 raise UserError(
                     f"{own} describes another camera than {camera_file}; leave --camera out, or "

@@ -11,7 +11,6 @@ ignored. The cameras are pinholes.
 import csv
 import filecmp
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -24,12 +23,15 @@ from mtlnet.data.labels_file import (
     UNKNOWN,
     Cells,
     check_cells,
+    check_name,
     lane_cells,
+    normal_name,
     path_within,
     write_cells,
 )
 from mtlnet.inference.image_decoding.decode import read_whole_image
 from runtime.camera_file import write_camera
+from runtime.files import atomic_write
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 from trackfeatures.road_class import BEND_CURVATURE
@@ -105,7 +107,7 @@ def import_labels(table: Path, folder: Path, stds: Sequence[LabelStd] = ()) -> d
         source, target = table.parent / cells["file"], folder / cells["file"]
         if not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+            atomic_write(target, source.read_bytes())
         if camera not in cameras:
             cameras[camera] = _write_camera(folder, camera, pitches[camera])
         cells["camera"] = cameras[camera]
@@ -123,7 +125,8 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
     """Read the table; returns, for each row, the line number and the cells by column. Raises
     UserError for a faulty header, a faulty row and a repeated file.
 
-    Bytes that are not UTF-8 become surrogates, as in file names.
+    File names are normalized (`normal_name`). Bytes that are not UTF-8 become surrogates, as in
+    file names.
     """
     lines: dict[str, int] = {}
     rows: list[tuple[int, dict[str, str]]] = []
@@ -140,6 +143,7 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
                 where = f"{table}, line {reader.line_num}"
                 if None in row or None in row.values():
                     raise UserError(f"{where}: it does not have {len(names)} values")
+                row["file"] = normal_name(row["file"])
                 first = lines.setdefault(row["file"], reader.line_num)
                 if first != reader.line_num:
                     raise UserError(f"{where}: {row['file']} stands in line {first} already")
@@ -158,13 +162,17 @@ def _converted(
     Raises UserError or ValueError."""
     if not path_within(row["file"]):
         raise UserError(f"the file {row['file']!r} is not a path inside the table's folder")
+    check_name(row["file"])
+    camera_height_m = _number(row, "camera_height_m")
+    if camera_height_m <= 0:
+        raise UserError(f"camera_height_m is {camera_height_m:g}; it must be above 0")
     height, width = read_whole_image(folder / row["file"]).shape[:2]
     camera = CameraParameters(
         width=width,
         height=height,
         fov_y_deg=_number(row, "fov_y_deg"),
         x=0.0,
-        z=_number(row, "camera_height_m") - CameraParameters.cg_height_m,
+        z=camera_height_m - CameraParameters.cg_height_m,
     )
     curvature = _number(row, "curvature_1pm") if row.get("curvature_1pm") else 0.0
     bend = "left" if curvature > 0 else "right"

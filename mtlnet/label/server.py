@@ -31,6 +31,7 @@ from mtlnet.inference.rectification import Rectification
 from mtlnet.label.folder import LabelChangedError, LabelFolder, heading_of, row_version
 from mtlnet.label.geometry import Markings, fit_markings, handles, marking_pixels
 from runtime.access import HostNames
+from runtime.cli import describe
 from runtime.files import locked_folder, name_as_text
 from runtime.sockets import address, bind_all
 from trackfeatures.camera import CameraParameters
@@ -260,13 +261,20 @@ def create_app(labeller: Labeller, names: HostNames, token: str | None) -> Asgi:
 
 
 def _answer_errors(app: FastAPI, folder: Path) -> None:
-    """Make `app` answer a UserError and a faulty request with one line of text, `detail`. The line
-    names files without the path of `folder` on this machine."""
+    """Make `app` answer a UserError, an OSError and a faulty request with one line of text,
+    `detail`. The line names files without the path of `folder` on this machine."""
+
+    def short(text: str) -> str:
+        return name_as_text(text.replace(f"{folder}/", ""))
 
     @app.exception_handler(UserError)
     async def refuse(_request: Any, error: UserError) -> Response:
         status = 409 if isinstance(error, LabelChangedError) else 422
-        return _refused(status, name_as_text(str(error).replace(f"{folder}/", "")))
+        return _refused(status, short(str(error)))
+
+    @app.exception_handler(OSError)
+    async def report(_request: Any, error: OSError) -> Response:
+        return _refused(500, short(describe(error)))
 
     @app.exception_handler(RequestValidationError)
     async def refuse_form(_request: Any, error: RequestValidationError) -> Response:
@@ -286,14 +294,10 @@ def _checked(app: Asgi, names: HostNames, token: str | None) -> Asgi:
     """Return `app` with a check of every request before it (`_refusal`)."""
 
     async def run(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http":
-            refusal = _refusal(scope, names, token)
-            if refusal is not None:
-                await refusal(scope, receive, send)
-                return
-        elif scope["type"] != "lifespan":
+        if scope["type"] != "http":
             return  # there is no WebSocket: uvicorn answers 403
-        await app(scope, receive, send)
+        answer = _refusal(scope, names, token) or app
+        await answer(scope, receive, send)
 
     return run
 
@@ -339,5 +343,8 @@ def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) ->
             f"{len(labeller.folder.files)} pictures; open {where}/{hint} and end with Ctrl-C\n"
         )
         sys.stderr.flush()
-        config = uvicorn.Config(app, log_level="warning", access_log=False, ws="none")
+        # A lifespan task that a second signal cancels would print a traceback.
+        config = uvicorn.Config(
+            app, log_level="warning", access_log=False, ws="none", lifespan="off"
+        )
         uvicorn.Server(config).run(sockets=listeners)

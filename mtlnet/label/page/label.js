@@ -4,6 +4,7 @@
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), ink = canvas.getContext("2d");
+const FIELDS = ["drive", "light"];
 const SIDES = ["left", "right"], NEAR = 0, BEND = 1, FAR = 2;
 const REACH = 34; // CSS px from a handle within which a touch takes it
 const COLOURS = { left: "#ffd23e", right: "#5ad1ff" };
@@ -13,6 +14,8 @@ let pictures = [], number = 0, shown = null, image = null, view = { scale: 1 };
 let drag = null, steps = [], saves = [], busy = false, again = false;
 let working = false; // while a save, an undo or a removal runs, keys and buttons are ignored
 const ahead = new Map(); // pictures that were fetched in advance
+const typed = {}; // drive and light as typed for pictures without a label
+let folder = null; // name of the folder, under which `typed` is stored
 
 async function call(path, method = "GET", body) {
   const headers = token ? { Authorization: `Bearer ${token}` } : {};
@@ -32,7 +35,8 @@ function say(text) { $("status").textContent = text; }
 async function start() {
   try {
     const listing = await (await call("api/pictures")).json();
-    pictures = listing.pictures;
+    ({ pictures, folder } = listing);
+    for (const id of FIELDS) remember(id, typed[id] ?? localStorage.getItem(`${folder}/${id}`) ?? "");
     $("locked").hidden = true;
     const first = pictures.findIndex((one) => !one.labelled);
     await open(first < 0 ? 0 : first);
@@ -51,10 +55,25 @@ function fetched(n) {
   return ahead.get(n);
 }
 
+// Shows the drive and light of the picture's label; without a label those that were typed last.
+function fill() {
+  for (const id of FIELDS) $(id).value = (shown?.row ? shown.row[id] : typed[id]) ?? "";
+}
+
+function remember(id, text) {
+  typed[id] = text;
+  if (folder !== null) localStorage.setItem(`${folder}/${id}`, text);
+}
+
+function keep(id) {
+  if (!shown?.row) remember(id, $(id).value); // otherwise the field belongs to the picture's label
+}
+
 async function open(n) {
   number = n;
   shown = image = drag = null; // nothing of the picture before can be saved for this picture
   steps = [];
+  fill();
   document.body.dataset.ready = "";
   say("");
   try {
@@ -64,7 +83,7 @@ async function open(n) {
     pictures[n].labelled = shown.row !== null; // another page may have changed it
     image = bitmap;
     $("heading").value = shown.heading;
-    if (shown.row) { $("drive").value = shown.row.drive || ""; $("light").value = shown.row.light || ""; }
+    fill();
     say(shown.note);
   } catch (error) {
     if (n !== number) return;
@@ -234,7 +253,8 @@ async function alone(work) {
 
 async function save() {
   if (!shown) return;
-  const of = number, texts = ["heading", "drive", "light"].map((id) => $(id).value);
+  const of = number, texts = ["heading", ...FIELDS].map((id) => $(id).value);
+  FIELDS.forEach(keep);
   await waiting;
   const { row, version } = await change(of, shown.version, "label", "PUT", label(shown.markings, ...texts));
   saves.push({ of, version });
@@ -305,6 +325,7 @@ window.addEventListener("keydown", (event) => {
 });
 for (const [id, key] of [["next", "n"], ["undo", "u"], ["remove", "x"], ["previous", "ArrowLeft"], ["skip", "ArrowRight"]])
   $(id).addEventListener("click", (event) => { event.currentTarget.blur(); act(KEYS[key]); });
+for (const id of FIELDS) $(id).addEventListener("input", () => keep(id));
 $("fixed").addEventListener("change", () => { if (shown) fit(); });
 $("token").addEventListener("change", () => { token = $("token").value.trim(); sessionStorage.setItem("token", token); start(); });
 window.addEventListener("resize", resize);

@@ -1,12 +1,19 @@
 """The cells of `labels.csv`: the lane of a row, and the distances that are accepted."""
 
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import trackfeatures as tf
-from mtlnet.data.labels_file import MARKING_LIMITS_M, check_cells, lane_cells, lane_sides
+from mtlnet.data.labels_file import (
+    MARKING_LIMITS_M,
+    check_cells,
+    lane_cells,
+    lane_sides,
+    read_cells,
+)
 from trackfeatures.definitions import LANE_WIDTH_LIMITS_M, MARKINGS, lane_offset
 from trackfeatures.errors import UserError
 
@@ -61,3 +68,14 @@ def test_every_lane_of_a_real_road_is_accepted() -> None:
     for width in (*LANE_WIDTH_LIMITS_M, 3.5):
         for ml in np.arange(-2.0 - width, 2.0, 0.05):
             check_cells({**REST, **lane_cells(float(ml), float(ml) + width)})
+
+
+def test_a_file_has_one_name(tmp_path: Path) -> None:
+    table = tmp_path / "labels.csv"
+    head, cells = "file,ml,mr,l,m,r,angle,heading\n", ",-1,2.5,?,?,?,0,?\n"
+    names = {"./b.jpg": "b.jpg", "c//./d.jpg": "c/d.jpg", "../e.jpg": "../e.jpg", "": ""}
+    table.write_text(head + "".join(name + cells for name in names))
+    assert [row["file"] for _, row in read_cells(table)] == list(names.values())
+    table.write_text(f"{head}b.jpg{cells}./b.jpg{cells}")
+    with pytest.raises(UserError, match=r"line 3: b\.jpg stands in line 2 already"):
+        read_cells(table)

@@ -89,7 +89,7 @@ def serve(folder: Path, token: str | None) -> Iterator[Site]:
     app = create_app(labeller, HostNames(["127.0.0.1"], any_name=token is not None), token)
     listener = bind("127.0.0.1", 0)
     listener.listen(16)
-    server = uvicorn.Server(uvicorn.Config(app, log_level="error", ws="none"))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="error", ws="none", lifespan="off"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

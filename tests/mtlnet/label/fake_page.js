@@ -5,14 +5,18 @@
 // "0s": its class "straight" follows from its lines.
 // KEYS: names of keys with commas between them; they are pressed without a pause. "." waits until
 // all requests are answered, "fail" makes the next request fail, "show N" opens picture N, "drag"
-// edits the picture, "other N" is another page that labels picture N or removes its label.
+// edits the picture, "other N" is another page that labels picture N or removes its label, "type
+// FIELD TEXT" types into a field, "reload" loads the page again. The labels at the start have the
+// drive "old".
 "use strict";
 const fs = require("fs"), vm = require("vm");
 const [file, labelled, keys] = process.argv.slice(2);
 const labels = [0, 1, 2, 3].map((n) => labelled.split(",").find((one) => one[0] === String(n)) || null);
 const versions = labels.map(() => 0);
 const earlier = labels.map(() => []); // for each picture the labels before each change
-const elements = {}, onKey = [], received = [];
+const drives = labels.map((one) => (one ? "old" : null));
+const received = [], stored = {};
+let elements = {}, onKey = [], page = null;
 let changes = 0, pending = 0, failing = false;
 
 const ink = new Proxy({}, { get: (of, name) => of[name] ?? (() => {}), set: () => true });
@@ -22,7 +26,9 @@ const element = (id) => (elements[id] ||= {
   getContext: () => ink, getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {},
 });
 const pair = (value) => ({ left: structuredClone(value), right: structuredClone(value) });
-const row = (n) => (labels[n] ? { file: `${n}.png`, heading: labels[n].endsWith("s") ? "straight" : "left" } : null);
+const row = (n) => (labels[n] ? {
+  file: `${n}.png`, heading: labels[n].endsWith("s") ? "straight" : "left", drive: drives[n],
+} : null);
 const picture = (n) => ({
   file: `${n}.png`, width: 100, height: 75, camera_pitch_deg: 0, note: "",
   heading: labels[n]?.endsWith("s") ? "" : row(n)?.heading ?? "",
@@ -40,7 +46,9 @@ function change(n, label) {
 function answer(path, method, body) {
   const n = Number(/pictures\/(\d+)/.exec(path)?.[1]);
   const version = /\?version=(.*)/.exec(path)?.[1];
-  if (path === "api/pictures") return { pictures: labels.map((one, i) => ({ file: `${i}.png`, labelled: Boolean(one) })) };
+  if (path === "api/pictures") return {
+    folder: "mine", pictures: labels.map((one, i) => ({ file: `${i}.png`, labelled: Boolean(one) })),
+  };
   if (path.endsWith("fit")) return { ...picture(n), markings: { ...picture(n).markings, ml: -1.77 } };
   if (method === "GET") return picture(n);
   if (version !== String(versions[n])) return null;
@@ -50,6 +58,7 @@ function answer(path, method, body) {
   } else if (labels[n] || method === "PUT") {
     received.push(method === "PUT" ? `PUT ${n} ${body.ml} ${body.heading}` : `DELETE ${n}`);
     change(n, method === "PUT" ? String(n) : null);
+    drives[n] = body?.drive;
   }
   return { row: row(n), version: String(versions[n]) };
 }
@@ -65,14 +74,19 @@ async function fetch(path, { method, body }) {
   return { ok, status: ok ? 200 : 500, json: async () => told, blob: async () => ({}) };
 }
 
-const page = vm.createContext({
-  document: { getElementById: element, body: { dataset: {}, clientWidth: 800 } },
-  window: { innerHeight: 600, addEventListener: (name, work) => { if (name === "keydown") onKey.push(work); } },
-  location: { hash: "" }, sessionStorage: { getItem: () => null }, fetch, structuredClone,
-  createImageBitmap: async () => ({ width: 100, height: 75 }),
-});
 const source = fs.readFileSync(file, "utf8");
-vm.runInContext(`${source}; this.found = () => ({ number, labelled: pictures.map((one) => one.labelled), shown: shown && shown.file }); this.show = open;`, page);
+function load() {
+  elements = {};
+  onKey = [];
+  page = vm.createContext({
+    document: { getElementById: element, body: { dataset: {}, clientWidth: 800 } },
+    window: { innerHeight: 600, addEventListener: (name, work) => { if (name === "keydown") onKey.push(work); } },
+    location: { hash: "" }, sessionStorage: { getItem: () => null }, fetch, structuredClone,
+    localStorage: { getItem: (name) => stored[name] ?? null, setItem: (name, text) => { stored[name] = text; } },
+    createImageBitmap: async () => ({ width: 100, height: 75 }),
+  });
+  vm.runInContext(`${source}; this.found = () => ({ number, labelled: pictures.map((one) => one.labelled), shown: shown && shown.file }); this.show = open;`, page);
+}
 
 const press = (key) => onKey.forEach((work) => work({ key, target: { tagName: "BODY" }, preventDefault() {} }));
 async function settle() {
@@ -84,16 +98,24 @@ function drag() {
   on.pointerdown(at(1, 70)); on.pointermove(at(5, 70)); on.pointerup(at(5, 70));
 }
 
+function type(field, text) {
+  element(field).value = text;
+  element(field).on.input?.();
+}
+
 (async () => {
-  await settle();
+  load();
+  if (!keys.startsWith("type")) await settle(); // a field can be used before the first picture is shown
   for (const key of keys.split(",")) {
     if (key === ".") await settle();
     else if (key === "fail") failing = true;
     else if (key === "drag") drag();
     else if (key.startsWith("other ")) change(Number(key.slice(6)), labels[key.slice(6)] ? null : key.slice(6));
     else if (key.startsWith("show ")) await page.show(Number(key.slice(5)));
+    else if (key === "reload") load();
+    else if (key.startsWith("type ")) type(...key.split(" ").slice(1));
     else press(key);
   }
   await settle();
-  console.log(JSON.stringify({ ...page.found(), received, status: elements.status.textContent, stored: labels.map(Boolean) }));
+  console.log(JSON.stringify({ ...page.found(), received, status: elements.status.textContent, stored: labels.map(Boolean), drives, drive: element("drive").value }));
 })();

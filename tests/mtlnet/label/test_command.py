@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +19,10 @@ import trackfeatures as tf
 from mtlnet.data.labels_file import read_labels
 from mtlnet.label.folder import LabelFolder
 from mtlnet.label.server import Labeller
+from runtime.files import locked_folder
 from tests.mtlnet.label.conftest import Site
 from tests.mtlnet.label.test_import import HEAD, table
-from tests.mtlnet.test_cli import refused
+from tests.mtlnet.test_cli import mtlnet, refused
 from tests.typed import typed
 from trackfeatures.camera import CameraParameters
 
@@ -60,7 +62,8 @@ def test_a_picture_begins_with_the_models_answer(pictures: Path) -> None:
     assert "the image shows" in narrow["note"]
 
 
-def test_the_command_serves_and_ends_with_ctrl_c(pictures: Path) -> None:
+@pytest.mark.parametrize("names", ["SIGINT", "SIGTERM", "SIGHUP", "SIGINT SIGINT"])
+def test_the_command_serves_and_ends_with_a_signal(pictures: Path, names: str) -> None:
     command = [sys.executable, "-m", "mtlnet", "label", str(pictures), "--no-model", "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -71,17 +74,58 @@ def test_the_command_serves_and_ends_with_ctrl_c(pictures: Path) -> None:
             assert Site(pictures, int(found[1])).ask("GET", "/api/pictures")[0] == 200
             assert "another process is writing to" in refused("label", pictures, "--no-model")
         finally:
-            process.send_signal(signal.SIGINT)
-    assert process.returncode in (0, 130)
+            for name in names.split():
+                process.send_signal(signal.Signals[name])
+                time.sleep(0.02)  # so that two signals are not one
+        rest = process.stderr.read()
+    assert process.returncode in (0, 130), rest
+    assert "Traceback" not in rest
+
+
+def test_the_assumed_mount_of_a_camera_file_is_printed(pictures: Path) -> None:
+    (pictures / "camera.yaml").unlink()
+    camera = pictures.parent / "ros.yaml"
+    matrix = "[500, 0, 320, 0, 500, 180, 0, 0, 1]"
+    camera.write_text(
+        f"{{image_width: 640, image_height: 360, camera_matrix: {{data: {matrix}}}, "
+        "distortion_model: plumb_bob, distortion_coefficients: {data: [0, 0, 0, 0, 0]}}\n"
+    )
+    with locked_folder(pictures):  # the command ends when it has read the camera
+        done = mtlnet("label", pictures, "--no-model", "--camera", camera)
+    note, error = done.stderr.splitlines()
+    assert note.startswith(
+        f"{camera}: a calibration of OpenCV or ROS; no mount is given, so 1.2 m above the road and "
+        "pitch 0 deg are assumed"
+    )
+    assert "another process is writing to" in error
 
 
 def test_mistakes_are_one_line(pictures: Path, tmp_path: Path) -> None:
     seen = refused("label", pictures, "--no-model", "--host", "0.0.0.0")
     assert "--host 0.0.0.0 can be reached from other machines: set a token" in seen
     assert "--label-std belongs to --import" in refused("label", pictures, "--label-std", "1,1")
+    assert "--json belongs to --import" in refused("label", tmp_path / "none", "--json")
     both = refused("label", pictures, "--import", "table.csv", "--camera", "camera.yaml")
     assert "--import takes the cameras from its table; leave --camera out" in both
     assert "there is no folder" in refused("label", tmp_path / "none", "--no-model")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--host", "127.0.0.1"), "--host"),
+        (("--port", "8010"), "--port"),
+        (("--token-file", "token"), "--token-file"),
+        (("--insecure", "--no-model", "--model", "default"), "--model, --no-model, --insecure"),
+    ],
+)
+def test_options_of_the_page_are_refused_with_import(
+    tmp_path: Path, options: tuple[str, ...], named: str
+) -> None:
+    path = table(tmp_path / "theirs", "a.png,1.7,-1.9,0.03,40,1.22", head=HEAD)
+    seen = refused("label", tmp_path / "mine", "--import", path, *options)
+    assert seen == f"error: --import does not open the page; leave {named} out"
+    assert not (tmp_path / "mine").exists()
 
 
 def test_a_table_is_imported_by_the_command(tmp_path: Path) -> None:

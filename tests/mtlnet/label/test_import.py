@@ -1,8 +1,10 @@
 """Tables of other terms become a folder that `evaluate` reads; faulty ones are one clear line."""
 
+import errno
 import os
 import shutil
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -95,14 +97,18 @@ def test_an_imported_folder_opens_after_a_label_was_removed(tmp_path: Path) -> N
     [
         ("a.png,x,-1.9,0,40,1.22", "line 2: x_left_m is 'x', not a number"),
         ("../a.png,1.7,-1.9,0,40,1.22", r"line 2: the file '\.\./a\.png' is not a path"),
+        (" a.png,1.7,-1.9,0,40,1.22", "line 2: the file name ' a.png' cannot be written"),
         ("c.png,1.7,-1.9,0,40,1.22", r"line 2: there is no image file .*c\.png"),
         ("a.png,1.7,-7,0,40,1.22", "line 2: mr is 7 m; it must be from 0.5 to 5.5"),
         ("a.png,1.7,-1.9,2,40,1.22", "line 2: angle is 2; it must be within 0.5 rad"),
         ("a.png,1.7,-1.9,0,400,1.22", r"line 2: vertical field of view 400\.0 deg"),
+        ("a.png,1.7,-1.9,0,40,0", "line 2: camera_height_m is 0; it must be above 0"),
+        (f"{ROW}\nb.png,1.7,-1.9,0,40,-1.2", r"line 3: camera_height_m is -1\.2; it must be"),
         ("a.png,1.7,-1.9,0,40", "line 2: it does not have 6 values"),
         ("a.png,1.7,-1.9,0,40,1.22,9", "line 2: it does not have 6 values"),
         ('a.png,"1.7"x,-1.9,0,40,1.22', "after line 1: ',' expected after"),
         (f"{ROW}\nb.png,1.7,-1.9,0,40,1.22\n{ROW}", r"line 4: a\.png stands in line 2 already"),
+        (f"{ROW}\n./{ROW}", r"line 3: a\.png stands in line 2 already"),
         ("b.png,1.7,-1.9,0,40,1.22\n../x.png,1.7,-1.9,0,40,1.22", "line 3: the file"),
     ],
 )
@@ -176,3 +182,22 @@ def test_faulty_tables_and_options_are_refused(tmp_path: Path) -> None:
         import_labels(table(tmp_path / "theirs", head=HEAD), tmp_path / "mine")
     with pytest.raises(UserError, match=r"--label-std is '0.06'; give METRES,RADIANS"):
         parse_label_std(["0.06"])
+
+
+def test_an_interrupted_copy_leaves_no_file(tmp_path: Path) -> None:
+    path = table(tmp_path / "theirs", ROW, head=HEAD)
+
+    def interrupted(partial: Path, data: bytes) -> None:
+        with partial.open("wb") as file:
+            file.write(data[:10])
+        raise OSError(errno.ENOSPC, "No space left")
+
+    with (
+        mock.patch("pathlib.Path.write_bytes", interrupted),
+        pytest.raises(OSError, match=r"No space left.*a\.png"),
+    ):
+        import_labels(path, tmp_path / "mine")
+    assert not list((tmp_path / "mine").iterdir())
+    assert import_labels(path, tmp_path / "mine")["pictures"] == 1
+    copied = tmp_path / "mine" / "a.png"
+    assert copied.read_bytes() == (path.parent / "a.png").read_bytes()

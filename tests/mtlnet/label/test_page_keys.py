@@ -113,3 +113,25 @@ def test_a_failed_request_is_shown_and_can_be_repeated() -> None:
     assert (found["received"], found["status"]) == (["PUT 0 -1 "], "no answer")
     found = press("", "Enter,.,fail,u,.,u")
     assert found["received"] == ["PUT 0 -1 ", "UNDO 0"]
+
+
+@pytest.mark.parametrize(
+    ("labelled", "keys", "drives", "shown"),
+    [
+        # A look at a labelled picture, or its saving, does not change what was typed.
+        ("0", "type drive b,.,show 0,.,show 1,.,Enter,.", ["old", "b"], "b"),
+        ("0", "type drive b,.,show 0,.,Enter,.,Enter,.", ["old", "b", None, None], "b"),
+        ("0", "show 0,.,type drive c,Enter,.,Enter,.", ["c", "", None, None], ""),
+        # What was typed is shown again after a reload, also if nothing was saved.
+        ("", "type drive b,.,reload,.,Enter,.", ["b", None, None, None], "b"),
+        ("0", ".,type drive b,show 0,.,reload,.,Enter,.", ["old", "b", None, None], "b"),
+        ("", "type drive b,.,Enter,.,type drive b2,Enter,.,u,.,reload,.", ["b", "b2"], "b2"),
+        # An emptied field stays empty.
+        ("", ".,type drive b,Enter,.,type drive ,reload,.,Enter,.", ["b", "", None, None], ""),
+    ],
+)
+def test_the_typed_drive_stays_for_the_next_pictures_without_a_label(
+    labelled: str, keys: str, drives: list[str | None], shown: str
+) -> None:
+    found = press(labelled, keys)
+    assert (found["drives"][: len(drives)], found["drive"]) == (drives, shown)
