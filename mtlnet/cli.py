@@ -184,12 +184,10 @@ def evaluate_command(
     _print_model(model)
     # Several engines of one thread each take more frames a second than one engine on all cores.
     # On a GPU these threads decode images for one engine.
-    engines = [_load(model, engine, precision, gpu=True, views=views)]
-    for _ in range(1, os.cpu_count() or 1):
-        shared = getattr(engines[0], "on_gpu", False)
-        engines.append(
-            engines[0] if shared else _load(model, engine, precision, gpu=True, views=views)
-        )
+    chosen, count = (model, engine, precision), os.cpu_count() or 1
+    engines = count * [_load(*chosen, gpu=True, views=views)]
+    if not getattr(engines[0], "on_gpu", False):
+        engines[1:] = [_load(*chosen, gpu=True, views=views) for _ in engines[1:]]
     with command.progress("evaluating") as report:
         if protocol:
             result = evaluate_protocol(engines, data, protocol, report, every)
@@ -328,12 +326,7 @@ def _print_model(name: str) -> None:
 
 
 def _load(
-    model: str,
-    kind: str,
-    precision: str | None,
-    *,
-    gpu: bool = False,
-    views: int = 1,
+    model: str, kind: str, precision: str | None, *, gpu: bool = False, views: int = 1
 ) -> "Engine":
     """Load a model's engine, with one thread. `gpu`: the torch engine can use a GPU."""
     from mtlnet.inference.engine import load_engine, parse_kind, parse_precision
