@@ -184,7 +184,8 @@ class World:
     def features(self) -> tf.TrackFeatures:
         """Return the true track features of the current state.
 
-        Distances are measured in the road plane, from the foot of the centre of gravity on it.
+        Distances are horizontal, across the road, from the foot of the centre of gravity on the
+        road plane.
         """
         now = self.state
         piece = int(self._memory[PIECE])
