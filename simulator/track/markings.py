@@ -20,7 +20,8 @@ class MarkingStyle:
     kerbs: bool = False
     """Whether bends have red and white kerbs beside the asphalt."""
     wear: float = 0.0
-    """Share of the paint that is worn away in patches: 0 is fresh paint, 1 no paint."""
+    """Share of the paint that is worn away in patches: 0 is fresh paint; with 1 there is
+    no paint in the patches, and two thirds of it between them."""
 
 
 def imported_style(name: str, *, kerbs: bool) -> MarkingStyle:

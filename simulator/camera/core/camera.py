@@ -143,7 +143,9 @@ class Camera:
             # Cars of different rounds differ in colour; index 0 is the ego car's colour.
             first_paint=1 + seed % 5,
             cars=shared_cars(graphics, *([NIGHT] if look and look.light.night else [])),
-            imaging=Imaging(look, light, self.parameters, scene.bridges) if look else None,
+            imaging=Imaging(look, light, self.parameters, scene.bridges, self.road.track.length_m)
+            if look
+            else None,
         )
 
     def render(

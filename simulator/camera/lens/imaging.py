@@ -36,10 +36,16 @@ DARK_NOISE = 1.8
 
 class Imaging:
     """Applies the effects of cabin, lens and sensor to the pictures of one camera. `look` gives the
-    effects, `light` the light of the scene, `bridges` the places where the exposure adapts."""
+    effects, `light` the light of the scene, `bridges` the places where the exposure adapts, on a
+    lap of `lap_m` (m)."""
 
     def __init__(
-        self, look: RoadLook, light: Light, camera: CameraParameters, bridges: Sequence[Bridge]
+        self,
+        look: RoadLook,
+        light: Light,
+        camera: CameraParameters,
+        bridges: Sequence[Bridge],
+        lap_m: float,
     ) -> None:
         width, height = camera.width, camera.height
         self._lens, self._light, self._flare = look.lens, light, look.light.flare
@@ -48,7 +54,7 @@ class Imaging:
         self._motion = _motion_of(camera, look.lens.travel_m)
         self._glass = glass_of(look, light, width, height)
         adapts = 0.0 if look.light.night else look.light.adaptation_stops
-        self._adaptation = adapts, [_deck(bridge) for bridge in bridges]
+        self._adaptation = adapts, [_deck(bridge) for bridge in bridges], lap_m
         self._night = look.light.night
         self._normal = noise_table()
         self._noise = look.lens.noise * (DARK_NOISE if look.light.night else 1.0)
@@ -114,17 +120,17 @@ def _motion_of(camera: CameraParameters, travel_m: float) -> tuple[float, float,
     return float(u), float(v), float(camera.height_above_road_m * matrix[1, 1]), travel_m
 
 
-def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]]) -> float:
-    """Return the number of stops by which the exposure is increased at `s` (m) along the road.
-    Below a bridge it rises to at most `stops`, behind the bridge it falls to 0. `decks` contains
-    the position along the road and half the length of each deck (m)."""
+def adaptation(s: float, stops: float, decks: Sequence[tuple[float, float]], lap_m: float) -> float:
+    """Return the number of stops by which the exposure is increased at `s` (m) along the road, also
+    by a bridge before the start line. Below a bridge it rises to at most `stops`, behind the bridge
+    it falls to 0. `decks` contains the position along the road and half the length of each deck
+    (m); `lap_m` is the length of the lap (m)."""
     most = 0.0
     for place, half in decks:
-        into = min(s - (place - half), 2.0 * half)
-        behind = max(s - (place + half), 0.0)
-        if into > 0.0:
-            opened = 1.0 - math.exp(-into / ADAPTING_M)
-            most = max(most, opened * math.exp(-behind / ADAPTING_M))
+        driven = (s - (place - half)) % lap_m
+        into, behind = min(driven, 2.0 * half), max(driven - 2.0 * half, 0.0)
+        opened = 1.0 - math.exp(-into / ADAPTING_M)
+        most = max(most, opened * math.exp(-behind / ADAPTING_M))
     return stops * most
 
 

@@ -54,7 +54,8 @@ void main() {
     // No paint on the most repaired patches.
     float gap = smoothstep(1.0 - missing - 0.03, 1.0 - missing + 0.03, broad.b);
     gap *= step(0.001, missing);
-    paint *= left_over * (1.0 - 0.92 * gap);
+    float visible = left_over * (1.0 - 0.92 * gap);
+    paint *= visible;
     colour = mix(colour, paint_colour * (0.88 + 0.24 * fine.r), paint);
 
 #ifdef RAIN
@@ -78,9 +79,9 @@ void main() {
     // The class at the pixel's centre: classes cannot be blended.
 #ifdef VARIED
     // The length of the footprint is above the spacing of float32 at the end of a long lap.
-    bool painted = paint_of_lines(s, y, 0.02, 1e-4, number).a > 0.5 && gap < 0.5;
+    bool painted = paint_of_lines(s, y, 0.02, 1e-4, number).a > 0.5 && visible > 0.5;
 #else
-    bool painted = abs(y - line_y) < left_line.w && gap < 0.5;
+    bool painted = abs(y - line_y) < left_line.w && visible > 0.5;
     if (divider && fract(s / dashes.y) * dashes.y > dashes.x) painted = false;
 #endif
     OUTPUT(pixel, painted ? MARKING : ROAD);

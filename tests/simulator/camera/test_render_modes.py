@@ -311,3 +311,22 @@ def test_the_lines_of_a_varied_road_have_their_class_to_the_end_of_a_long_lap() 
             kind = camera.render_views(standing_pose(road, s, 0.0), views=("front:class",))
             counts[s] = int((kind["front:class"] == MARKING).sum())
     assert min(counts[1300.0], counts[3000.0]) > 0.6 * counts[400.0] > 0
+
+
+def test_patches_whose_paint_is_worn_away_are_road() -> None:
+    track = find_track("coast")
+    worn = replace(track, markings=replace(track.markings, wear=1.0, left_colour="white"))
+    camera = CameraParameters(1120, 840)
+    overcast = Light.named("overcast", np.random.default_rng(0))
+    dark = total = 0
+    with Camera(Road(worn, 1), camera, seed=5, light=overcast) as drawn:
+        for s in range(100, 500, 100):
+            found = drawn.render_views(
+                standing_pose(drawn.road, s, 0.0), views=("front", "front:class")
+            )
+            kind, grey = found["front:class"][520:], found["front"][520:].mean(2)
+            marked = cv2.erode((kind == MARKING).astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
+            dark += int((grey[marked] < np.median(grey[kind == ROAD]) + 12).sum())
+            total += int(marked.sum())
+    assert total > 1000
+    assert dark < 0.01 * total

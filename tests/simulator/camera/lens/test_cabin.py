@@ -69,11 +69,18 @@ def test_drops_cover_their_share_and_the_wiper_comes_back() -> None:
 
 def test_exposure_opens_under_a_bridge_and_closes_behind_it() -> None:
     bridge = [(100.0, 6.0)]
-    assert adaptation(90.0, 1.5, bridge) == 0.0
+    assert adaptation(90.0, 1.5, bridge, 3000.0) < 1e-9
     opened = [1.5 * (1.0 - np.exp(-way / ADAPTING_M)) for way in (6.0, 12.0)]
-    assert abs(adaptation(100.0, 1.5, bridge) - opened[0]) < 1e-9
-    assert abs(adaptation(106.0, 1.5, bridge) - opened[1]) < 1e-9
-    assert abs(adaptation(106.0 + ADAPTING_M, 1.5, bridge) - opened[1] / np.e) < 1e-9
+    assert abs(adaptation(100.0, 1.5, bridge, 3000.0) - opened[0]) < 1e-9
+    assert abs(adaptation(106.0, 1.5, bridge, 3000.0) - opened[1]) < 1e-9
+    assert abs(adaptation(106.0 + ADAPTING_M, 1.5, bridge, 3000.0) - opened[1] / np.e) < 1e-9
+
+
+def test_exposure_does_not_jump_at_the_start_line() -> None:
+    bridge = [(2997.0, 6.0)]
+    before, after = (adaptation(s, 1.5, bridge, 3000.0) for s in (3000.0 - 1e-6, 0.0))
+    assert before > 0.5
+    assert abs(after - before) < 1e-3
 
 
 def test_exposure_stops_night_and_a_low_sun_change_the_light() -> None:
@@ -92,10 +99,10 @@ def test_a_picture_is_a_function_of_its_place() -> None:
     look = RoadLook(lens=Lens(noise=3.0, travel_m=0.1, jpeg_quality=40, sharpening=0.5))
     camera = CameraParameters()
     picture = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    imaging = Imaging(look, LIGHT, camera, ())
+    imaging = Imaging(look, LIGHT, camera, (), 3000.0)
     here, there = (optics.eye_of(camera, (x, 0, 0, 0, 0, 0), "front") for x in (1.0, 1.5))
     first = imaging.developed(picture, here, 1.0)
     imaging.developed(picture, there, 1.5)
-    again = Imaging(look, LIGHT, camera, ()).developed(picture, here, 1.0)
+    again = Imaging(look, LIGHT, camera, (), 3000.0).developed(picture, here, 1.0)
     assert np.array_equal(first, again)
     assert np.mean(first != imaging.developed(picture, there, 1.0)) > 0.3
