@@ -6,6 +6,8 @@ stages. If the run is started again with the same work folder, it continues with
 
 import csv
 import json
+import statistics
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,8 @@ MAX_CURVE_ROWS = 2_000
 MAX_BYTES = 16 * 2**20
 """Largest size of the output folder in bytes."""
 DONE, FAILED, STOPPED, SKIPPED, RUNNING = "done", "failed", "stopped", "skipped", "running"
+WHOLE_RUN = 150_000
+"""Number of steps of a whole training with the recipe `paper`."""
 
 
 class Report:
@@ -80,3 +84,28 @@ class Report:
 
     def out_bytes(self) -> int:
         return sum(path.stat().st_size for path in self.out.rglob("*") if path.is_file())
+
+
+def timing(points: list[dict[str, float]]) -> dict[str, Any]:
+    """Return steps, seconds and speed of a training from the rows of its curves; {} without rows.
+
+    `step_ms`: median time of a step. `whole_run_s`: time in s of 150,000 steps, extrapolated from
+    the steps after the first row, because the GPU's code is compiled in the ten steps before it.
+    """
+    if not points:
+        return {}
+    first, last = points[0], points[-1]
+    found = {
+        "steps": int(last["step"]),
+        "train_seconds": last["elapsed_s"],
+        "images_per_second": round(statistics.median(p["images_per_second"] for p in points), 1),
+    }
+    taken = last["step"] - first["step"]
+    if taken:
+        each = (last["elapsed_s"] - first["elapsed_s"]) / taken
+        gaps = [
+            (b["elapsed_s"] - a["elapsed_s"]) / (b["step"] - a["step"]) for a, b in pairwise(points)
+        ]
+        found["step_ms"] = round(1e3 * statistics.median(gaps), 4)
+        found["whole_run_s"] = round(first["elapsed_s"] + each * (WHOLE_RUN - first["step"]), 1)
+    return found

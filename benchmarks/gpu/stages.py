@@ -6,12 +6,10 @@ still run.
 
 import json
 import re
-import statistics
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ from benchmarks.gpu.collecting import (
 )
 from benchmarks.gpu.plan import Plan, Size
 from benchmarks.gpu.process import Command, Ended, log_tail, run
-from benchmarks.gpu.report import RUNNING, Report
+from benchmarks.gpu.report import RUNNING, Report, timing
 from benchmarks.gpu.wheels import ROOT
 from mtlnet.inference.curves import CURVES, read_curves
 from mtlnet.inference.model_card import CARD
@@ -36,8 +34,6 @@ MERGE_SHARE, LEAST_MERGE_S = 0.12, 30.0
 START_S = 12.0
 """Seconds that a collection needs for imports and planning before it records, in a run of ten
 minutes."""
-WHOLE_RUN = 150_000
-"""Number of steps of a whole training with the recipe `paper`."""
 EVALUATED = {"test": "test", "unseen": "unseen", "random": "unseen"}
 """The split of each dataset that is evaluated."""
 
@@ -212,31 +208,6 @@ def _time_recipe(task: Run, recipe: str) -> dict[str, Any]:
         raise StageFailed(log_tail(command.log) or "no ten steps were trained")
     if ended.code and not ended.stopped:
         raise StageFailed(log_tail(command.log), found)
-    return found
-
-
-def timing(points: list[dict[str, float]]) -> dict[str, Any]:
-    """Return steps, seconds and speed of a training from the rows of its curves; {} without rows.
-
-    `step_ms`: median time of a step. `whole_run_s`: time in s of 150,000 steps, extrapolated from
-    the steps after the first row, because the GPU's code is compiled in the ten steps before it.
-    """
-    if not points:
-        return {}
-    first, last = points[0], points[-1]
-    found = {
-        "steps": int(last["step"]),
-        "train_seconds": last["elapsed_s"],
-        "images_per_second": round(statistics.median(p["images_per_second"] for p in points), 1),
-    }
-    taken = last["step"] - first["step"]
-    if taken:
-        each = (last["elapsed_s"] - first["elapsed_s"]) / taken
-        gaps = [
-            (b["elapsed_s"] - a["elapsed_s"]) / (b["step"] - a["step"]) for a, b in pairwise(points)
-        ]
-        found["step_ms"] = round(1e3 * statistics.median(gaps), 4)
-        found["whole_run_s"] = round(first["elapsed_s"] + each * (WHOLE_RUN - first["step"]), 1)
     return found
 
 

@@ -162,7 +162,11 @@ class FrameTruth:
     def render(self, camera: Camera) -> NDArray[np.uint8]:
         """Render the image of the frame, (height, width, 3) uint8 RGB."""
         camera.change_scene(*self.scenery)
-        return camera.render(self.pose, self.frame.traffic, near_s=self.frame.place.s)
+        near_s, view = self.frame.place.s, ("front",)
+        found: NDArray[np.uint8] = camera.render_views(
+            self.pose, self.frame.traffic, view, near_s=near_s
+        )["front"]
+        return found
 
 
 def record_round(

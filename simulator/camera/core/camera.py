@@ -41,9 +41,7 @@ HEADLIGHT_AT = (2.1, 0.0, 0.4)
 def check_size(width: int, height: int) -> None:
     """Raises UserError unless `width` and `height` are from 8 to MAX_SIZE (4096) px."""
     if not (8 <= width <= MAX_SIZE and 8 <= height <= MAX_SIZE):
-        raise UserError(
-            f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} pixels"
-        )
+        raise UserError(f"picture size {width} x {height}; each side must be 8 to {MAX_SIZE} px")
 
 
 @dataclass(frozen=True)
@@ -149,22 +147,15 @@ class Camera:
         )
 
     def render(
-        self,
-        body_pose: ArrayLike,
-        others: ArrayLike | None = None,
-        view: str = "front",
-        *,
-        near_s: float | None = None,
+        self, body_pose: ArrayLike, others: ArrayLike | None = None, view: str = "front"
     ) -> Picture:
         """Draw `view`, one of VIEWS, from a car at `body_pose`; returns (height, width, 3) uint8
         RGB.
 
         `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity (m, rad). `others`
-        (n, 6) are the poses of other cars, with z on the ground below each car. `near_s`: as in
-        `render_views`; it is needed where a car jumps from place to place.
+        (n, 6) are the poses of other cars, with z on the ground below each car. For a car that jumps from
+        place to place use `render_views` with `near_s`.
         """
-        if near_s is not None:
-            self._last_s = near_s
         return self._views(body_pose, others, {view: ViewRequest(view)})[view]
 
     def render_views(
@@ -184,8 +175,7 @@ class Camera:
         car's approximate position (m) along the road, to distinguish a bridge from the road below
         it; None means the position in the last picture. Raises UserError for an unknown name.
         """
-        if near_s is not None:
-            self._last_s = near_s
+        self._last_s = self._last_s if near_s is None else near_s
         return self._views(body_pose, others, {name: ViewRequest.of(name) for name in views})
 
     def _views(
@@ -287,10 +277,8 @@ class Camera:
     def shadow_fraction(self, body_pose: ArrayLike, near_s: float | None = None) -> float:
         """Return the share (0 to 1) of the asphalt up to 30 m ahead of the car that is in hard
         shadow. `near_s`: as in `render_views`."""
-        if near_s is not None:
-            self._last_s = near_s
-        pose = np.asarray(body_pose, dtype=np.float64)
-        s = self._s_of(float(pose[0]), float(pose[1]))
+        self._last_s = self._last_s if near_s is None else near_s
+        s = self._s_of(*np.asarray(body_pose, dtype=np.float64)[:2].tolist())
         return self._loaded.scene.mask.fraction(s, self.road.half_asphalt)
 
     def _s_of(self, x: float, y: float) -> float:

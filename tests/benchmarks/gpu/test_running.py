@@ -22,9 +22,9 @@ from packaging.utils import canonicalize_name
 from benchmarks.gpu import report, wheels
 from benchmarks.gpu.plan import REHEARSAL, STAGES, Plan
 from benchmarks.gpu.process import Interrupted
-from benchmarks.gpu.report import DONE, FAILED, SKIPPED, STOPPED, Report
+from benchmarks.gpu.report import DONE, FAILED, SKIPPED, STOPPED, Report, timing
 from benchmarks.gpu.running import run_stages
-from benchmarks.gpu.stages import Run, StageFailed, timing
+from benchmarks.gpu.stages import Run, StageFailed
 from mtlnet.inference.curves import COLUMNS
 from mtlnet.inference.model_card import read_card
 from trackfeatures.errors import UserError

@@ -195,5 +195,6 @@ def test_the_shadow_share_of_a_car_that_jumps_is_that_of_its_place() -> None:
         expected = fresh.shadow_fraction(after)
         jumping.shadow_fraction(before, 463.0)
         assert jumping.shadow_fraction(after, 517.0) == expected
-        jumping.render(before, near_s=463.0)
-        assert np.array_equal(jumping.render(after, near_s=517.0), fresh.render(after))
+        jumping.render_views(before, near_s=463.0)
+        found = jumping.render_views(after, near_s=517.0)["front"]
+        assert np.array_equal(found, fresh.render(after))
