@@ -28,7 +28,7 @@ setup: $(READY) ## make .venv with everything in it (about 8 GB, minutes)
 # less than half of pip's time, but does not read pip's settings (mirrors, certificates): where it
 # fails, pip installs the lock. Python compiles what it imports, a seventh of the 21,000 modules, so
 # they are not compiled here.
-$(READY): pyproject.toml requirements.lock deploy/uv.txt
+$(READY): pyproject.toml requirements.lock
 	@"$(PYTHON)" -c 'import sys, venv, ensurepip; sys.exit(not $(SUPPORTED))' 2>/dev/null || \
 	  { echo "error: Python 3.11, 3.12, 3.13 or 3.14 with venv is needed, found: $$("$(or $(PYTHON),python3)" --version 2>&1 | head -n 1); install one" \
 	  "(python3-venv on Debian), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }

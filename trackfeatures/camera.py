@@ -63,12 +63,12 @@ class CameraParameters:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             pixels = getattr(self, name)
-            if not isinstance(pixels, Integral) or pixels < 1:
-                raise CameraError(f"the {name} of a camera is {pixels!r}; give whole px above 0")
+            if not isinstance(pixels, Integral) or pixels < 0:
+                raise CameraError(f"the {name} of a camera is {pixels!r}; give whole px")
         for name in ("x", "y", "z", "pitch_deg", "roll_deg", "yaw_deg"):
             value = getattr(self, name)
             if not isinstance(value, Real) or not isfinite(value):
-                raise CameraError(f"{name} of a camera is {value!r}; give a finite number")
+                raise CameraError(f"{name} is {value!r}, so the camera is impossible")
         if self.matrix is not None:
             matrix = _numbers("matrix", self.matrix, (4,))
             if min(matrix[:2]) <= 0:

@@ -5,6 +5,7 @@ every request, and its token if one is required, are checked by the rules of the
 (`runtime.access`). The page itself contains no data and needs no token.
 """
 
+import signal
 import sys
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import asdict, replace
@@ -338,13 +339,12 @@ def serve_folder(labeller: Labeller, host: str, port: int, token: str | None) ->
         for listener in listeners:  # before the address is printed, so that it answers at once
             listener.listen()
         where = address(listeners[0], host)
-        hint = "" if token is None else "#TOKEN"
-        sys.stderr.write(
-            f"{len(labeller.folder.files)} pictures; open {where}/{hint} and end with Ctrl-C\n"
-        )
+        hint, count = "" if token is None else "#TOKEN", len(labeller.folder.files)
+        sys.stderr.write(f"{count} pictures; open {where}/{hint} and end with Ctrl-C\n")
         sys.stderr.flush()
         # A lifespan task that a second signal cancels would print a traceback.
-        config = uvicorn.Config(
-            app, log_level="warning", access_log=False, ws="none", lifespan="off"
-        )
-        uvicorn.Server(config).run(sockets=listeners)
+        conf = uvicorn.Config(app, log_level="warning", access_log=False, ws="none", lifespan="off")
+        server = uvicorn.Server(conf)
+        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # uvicorn handles the other signals
+            signal.signal(signal.SIGHUP, lambda _, at: server.handle_exit(signal.SIGTERM, at))
+        server.run(sockets=listeners)
