@@ -54,8 +54,8 @@ def test_stages_know_until_when_they_may_take_and_none_begins_after_the_end(
     functions = {name: look(name) for name in STAGES}
     run_stages(replace(task, begin=time.monotonic() - 150.0), functions)
     assert left["forward"] == pytest.approx(0.3 * 15.0, abs=1.0)
-    assert left["train"] == pytest.approx(0.25 * 0.3 * 215.0, abs=1.0)
-    assert left["paper"] == pytest.approx(178.5 - 150.0, abs=1.0)
+    assert left["train"] == pytest.approx(0.25 * 0.3 * 202.0, abs=1.0)
+    assert left["paper"] == pytest.approx(174.6 - 150.0, abs=1.0)
     over = task_of(tmp_path / "over")
     run_stages(replace(over, begin=time.monotonic() - 178.0), functions)
     assert {stage["why"] for stage in over.report.content["stages"].values()} == {
