@@ -4,6 +4,7 @@ Three threads share the work: one decodes, one runs the network, one draws and w
 keeps the order of the images, so that answers and files do not depend on timing.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -73,16 +74,11 @@ def predict_files(
     sources = find_sources(list(inputs), note, topic)
     usable = [source for source in sources if not source.problem]
     require_inputs_kept(outputs, (file for source in sources for file in source.files))
-    for source in sources:
-        if source.problem and len(sources) > 1:  # the problem of a single source is the error
-            note(source.problem)
+    _note_unread(sources, note)
     sources = [
         with_lens(s, camera, lens, note, calibrate=calibrate, stated=stated) for s in sources
     ]
-    live = [source.name for source in usable if source.kind is SourceKind.STREAM]
-    for before, later in pairwise(live):
-        note(f"{later} is read when {before} has ended; to read both now, use two commands")
-    before_live = sum(s.count for s in takewhile(lambda s: s.name not in live[:1], usable))
+    before_streams = _images_before_streams(usable)
     answers = _Answers(engine, sum(source.count for source in sources), report)
     fps = usable[0].fps if usable else DEFAULT_FPS
 
@@ -98,13 +94,29 @@ def predict_files(
             for item in items:
                 answers.add(item, writing)
         except KeyboardInterrupt:
-            if not live or answers.used < before_live:
+            if answers.used < before_streams:
                 raise
             note(f"stopped after {answers.used} images")
     _report_streams(sources, answers, note)
-    if answers.used > KEPT_ROWS and not outputs:
-        note(f"{answers.used} images done, the result has the first {KEPT_ROWS}; --out has all")
+    if not outputs:
+        answers.note_missing_rows(note)
     return answers.finish()
+
+
+def _note_unread(sources: Sequence[Source], note: Note) -> None:
+    """Note the sources that are left out, and the streams that wait until another has ended."""
+    for source in sources:
+        if source.problem and len(sources) > 1:  # the problem of a single source is the error
+            note(source.problem)
+    live = [s.name for s in sources if s.kind is SourceKind.STREAM and not s.problem]
+    for before, later in pairwise(live):
+        note(f"{later} is read when {before} has ended; to read both now, use two commands")
+
+
+def _images_before_streams(sources: Sequence[Source]) -> float:
+    """Return the number of images before the first stream, infinite without a stream."""
+    before = list(takewhile(lambda source: source.kind is not SourceKind.STREAM, sources))
+    return sum(source.count for source in before) if len(before) < len(sources) else math.inf
 
 
 def _report_streams(sources: Sequence[Source], answers: "_Answers", note: Note) -> None:
@@ -165,6 +177,11 @@ class _Answers:
         """Add an error, unless the item that reports it has been added."""
         if error not in self._unusable:
             self._unusable.append(error)
+
+    def note_missing_rows(self, note: Note) -> None:
+        """Note that the result has not all images, if it has not."""
+        if self.used > KEPT_ROWS:
+            note(f"{self.used} images done, the result has the first {KEPT_ROWS}; --out has all")
 
     def finish(self) -> list[dict[str, Any]]:
         """The results of the first `KEPT_ROWS` images. Raises InputsLeftOut when an image could not

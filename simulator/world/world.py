@@ -184,8 +184,7 @@ class World:
     def features(self) -> tf.TrackFeatures:
         """Return the true track features of the current state.
 
-        Distances are horizontal, across the road, from the foot of the centre of gravity on the
-        road plane.
+        Distances are horizontal, from the foot of the centre of gravity on the road plane.
         """
         now = self.state
         piece = int(self._memory[PIECE])
