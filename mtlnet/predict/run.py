@@ -98,9 +98,7 @@ def predict_files(
                 raise
             note(f"stopped after {answers.used} images")
     _report_streams(sources, answers, note)
-    if not outputs:
-        answers.note_missing_rows(note)
-    return answers.finish()
+    return answers.finish(note, written=bool(outputs))
 
 
 def _note_unread(sources: Sequence[Source], note: Note) -> None:
@@ -178,14 +176,12 @@ class _Answers:
         if error not in self._unusable:
             self._unusable.append(error)
 
-    def note_missing_rows(self, note: Note) -> None:
-        """Note that the result has not all images, if it has not."""
-        if self.used > KEPT_ROWS:
-            note(f"{self.used} images done, the result has the first {KEPT_ROWS}; --out has all")
-
-    def finish(self) -> list[dict[str, Any]]:
-        """The results of the first `KEPT_ROWS` images. Raises InputsLeftOut when an image could not
+    def finish(self, note: Note, *, written: bool) -> list[dict[str, Any]]:
+        """The results of the first `KEPT_ROWS` images; notes if there are more, unless all results
+        have been `written` to an output. Raises InputsLeftOut when an image could not
         be used."""
+        if self.used > KEPT_ROWS and not written:
+            note(f"{self.used} images done, the result has the first {KEPT_ROWS}; --out has all")
         if not self._unusable:
             return self._results
         others = f"; {counted(self.used, 'image')} done" if self.used else ""
