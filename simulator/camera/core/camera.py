@@ -153,8 +153,8 @@ class Camera:
         RGB.
 
         `body_pose` (6,) is x, y, z, roll, pitch, yaw of the centre of gravity (m, rad). `others`
-        (n, 6) are the poses of other cars, with z on the ground below each car. For a car that jumps from
-        place to place use `render_views` with `near_s`.
+        (n, 6) are the poses of other cars, with z on the ground below each car. For a car that
+        jumps from place to place use `render_views` with `near_s`.
         """
         return self._views(body_pose, others, {view: ViewRequest(view)})[view]
 
