@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from simulator.arrays import FloatArray
 from simulator.camera.bridges.bridges import KEEP_FREE_M, Bridge, free_of
+from simulator.camera.bridges.styles import CONCRETE
 from simulator.camera.core.mesh import Chunks, Surface
-from simulator.camera.scene.road_mesh import Ground
+from simulator.camera.scene.road_mesh import Ground, RoadMesh
 from simulator.camera.scene.solids import (
     BOARD,
     CROWD,
@@ -226,6 +227,7 @@ def build(
     material's name. Lit lamps are placed on the right side, one every `lit_every_m` (m), none if it
     is 0."""
     placer = _Placer(ground, bridges)
+    _add_soffits(placer, ground.mesh)
     for bridge in bridges:
         placer.add_placed(bridge.s, bridge.triangles)
     length, wall = ground.road.track.length_m, ground.road.wall_offset
@@ -255,6 +257,17 @@ def build(
         placer.add(lamp(LIT), float(s), -(wall + 1.0), 0.6)
     placer.place()
     return _gathered(placer)
+
+
+def _add_soffits(placer: _Placer, mesh: RoadMesh) -> None:
+    """Add the undersides of the bridges on which the road crosses itself."""
+    edges = mesh.deck_edges()
+    for row in np.flatnonzero(mesh.bridge[:-1] | mesh.bridge[1:]).tolist():
+        (left, right), (far_left, far_right) = edges[row], edges[row + 1]
+        length, width = mesh.s[row + 1] - mesh.s[row], mesh.y[row, 0] - mesh.y[row, -1]
+        corners = [left, far_left, far_right, right]
+        uv = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width)]
+        placer.add_placed(mesh.s[row], face(corners, uv, CONCRETE[0], PLAIN))
 
 
 def _gathered(placer: _Placer) -> dict[str, Surface]:

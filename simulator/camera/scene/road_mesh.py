@@ -6,6 +6,7 @@ at (s, y) lies where the track geometry has that point.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -25,6 +26,10 @@ TWIST_M = 0.004
 """Largest deviation (m) of two triangles from the twisted road plane between two rows."""
 SKIRT_M = 10.0
 """Largest width of a skirt, the part of the mesh between wall line and terrain."""
+DECK_M, HEADROOM_M, CLEAR_M = 1.0, 3.0, 1.5
+"""Where the road crosses a part of itself that is more than HEADROOM_M lower, it is a bridge: the
+skirt ends DECK_M below the wall line. This part of the skirt is over the asphalt of the lower road
+and over CLEAR_M beside it. All in m."""
 KERB_CURVATURE = 1.0 / 220.0
 SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
 """Weights of geometric errors on the skirt and the kerb, relative to errors on the road."""
@@ -50,6 +55,14 @@ class RoadMesh:
     curvature: FloatArray
     wall: tuple[int, int]
     """Indices of the columns of the left and the right wall line."""
+    bridge: NDArray[np.bool_]
+    """Mask (R,) of the rows in which the road is a bridge over a lower part of itself."""
+
+    def deck_edges(self) -> FloatArray:
+        """Return the lower edges (R, 2, 3), m, left and right, that a bridge's deck has."""
+        edges = self.points[:, [0, -1]]
+        edges[..., 2] = self.points[:, list(self.wall), 2] - DECK_M
+        return edges
 
     def ground(self, row: NDArray[np.intp], offset: FloatArray) -> FloatArray:
         """Return the height (n,) m of the mesh in the rows `row` (n,) at lateral `offset` (n,) m,
@@ -95,12 +108,20 @@ def build(road: Road, line: CentreLineSamples, terrain: Terrain) -> RoadMesh:
     y[:, -1], y[:, -2] = -wall - right, -wall - 0.35 * right
     flat = road.track.at(s[:, None], y)
     points = np.stack([flat.x, flat.y, flat.z], axis=-1)
+    bridge = np.zeros(len(s), dtype=np.bool_)
     for outer, between, edge in ((0, 1, 2), (-1, -2, -3)):
         land = terrain.height(points[:, outer, 0], points[:, outer, 1]) - 0.6
+        over = _over_road(road, line, y[:, outer], points[:, outer, :2], points[:, edge, 2])
+        land = np.where(over, np.maximum(land, points[:, edge, 2] - DECK_M), land)
+        bridge |= over
         points[:, outer, 2] = np.minimum(land, points[:, edge, 2] + 4.0)
         rise = points[:, outer, 2] - points[:, edge, 2]
         points[:, between, 2] = points[:, edge, 2] + 0.12 * rise - 0.05
-    return RoadMesh(s, y, points, pose.curvature, (2, y.shape[1] - 3))
+    # A bridge that crosses askew is over the lower road first with one side, then with the other.
+    rows = np.flatnonzero(bridge)
+    for first, then in pairwise(rows):
+        bridge[first:then] |= s[then] - s[first] < 4.0 * wall
+    return RoadMesh(s, y, points, pose.curvature, (2, y.shape[1] - 3), bridge)
 
 
 def _skirt(
@@ -123,12 +144,25 @@ def _skirt(
     return width
 
 
+def _over_road(
+    road: Road, line: CentreLineSamples, offset: FloatArray, at: FloatArray, height: FloatArray
+) -> NDArray[np.bool_]:
+    """Return a mask (R,) of the rows whose outer points `at` (R, 2), m, are over the asphalt of a
+    lower part of the road, and of the rows next to them. `offset` (R,), m, is the lateral offset of
+    the points, `height` (R,), m, the height of the wall line in these rows."""
+    near, sample = line.tree.query(at)
+    under = near < np.minimum(np.abs(offset) - 1.0, road.half_asphalt + CLEAR_M)
+    under[under] = road.track.at(line.s[sample[under]]).z < height[under] - HEADROOM_M
+    return np.asarray(under | np.roll(under, 1) | np.roll(under, -1))
+
+
 def covers(mesh: RoadMesh, survey: Survey, margin_m: float) -> NDArray[np.bool_]:
     """Return a mask (rows, columns) of the grid points of `survey` that lie more than `margin_m`
-    (m) inside the outer edges of `mesh`."""
+    (m) inside the outer edges of `mesh`, but not below a bridge of the road."""
     row = np.clip(np.searchsorted(mesh.s, survey.line.s), 1, len(mesh.s) - 1)[survey.sample]
     reach = np.minimum(mesh.y[:, 0], -mesh.y[:, -1])
-    return np.asarray(survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m)
+    inside = survey.near < np.minimum(reach[row - 1], reach[row]) - margin_m
+    return np.asarray(inside & ~mesh.bridge[row])
 
 
 def surfaces(mesh: RoadMesh, road: Road) -> dict[str, Surface]:

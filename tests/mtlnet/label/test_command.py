@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,6 +63,15 @@ def test_a_picture_begins_with_the_models_answer(pictures: Path) -> None:
     assert "the image shows" in narrow["note"]
 
 
+@pytest.fixture
+def hangup() -> Iterator[None]:
+    """SIGHUP has its default action; tests started by `nohup` inherit that it is ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("hangup")
 @pytest.mark.parametrize("names", ["SIGINT", "SIGTERM", "SIGHUP", "SIGINT SIGINT"])
 def test_the_command_serves_and_ends_with_a_signal(pictures: Path, names: str) -> None:
     command = [sys.executable, "-m", "mtlnet", "label", str(pictures), "--no-model", "--port", "0"]

@@ -17,6 +17,7 @@ from simulator.track.markings import MarkingStyle
 from simulator.track.road import Road
 from simulator.varied.carriageway import Carriageway
 from simulator.varied.look import RoadLook
+from tests.simulator.track.track_samples import figure_of_eight
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -182,6 +183,22 @@ def test_objects_stand_beside_the_road(road: Road) -> None:
                     offsets.append(abs(offset))
     assert len(offsets) > 200
     assert min(offsets) > road.half_asphalt - 0.5
+
+
+def test_a_bridge_of_the_road_leaves_the_road_below_it_free() -> None:
+    """The figure of eight crosses itself at (0, 0): the lower road, along x, stays visible."""
+    road = Road(figure_of_eight())
+    pose = standing_pose(road, road.track.length_m - 25.0, 0.0)
+    with Camera(road, seed=1, light=light()) as camera:
+        found = camera.render_views(pose, views=("front:depth", "front:class"))
+        seen = places(camera, pose, found["front:depth"])
+    x, y, z = np.moveaxis(seen, -1, 0)
+    on_asphalt = (np.abs(x) < 40.0) & (np.abs(y) < road.half_asphalt)
+    assert ((z > 4.0) & on_asphalt & (found["front:class"] == OBJECT)).sum() > 500  # the underside
+    lower = on_asphalt & (z < 4.0)
+    assert np.abs(z[lower]).max() < 0.1
+    assert (lower & (x > 10.0)).sum() > 50  # beyond the bridge
+    assert np.isin(found["front:class"][lower], (ROAD, MARKING)).all()
 
 
 def test_depth_of_the_top_view_is_the_camera_height(road: Road) -> None:
