@@ -26,6 +26,8 @@ from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 KMH = 3.6  # km/h per m/s
+BRIDGE_M = 3.0
+"""Least height (m) of a road above another part of it that it crosses on a bridge."""
 CAMERA = "camera"
 """Name of the camera sensor, the only sensor that needs a `simulator.camera.Camera`."""
 
@@ -47,17 +49,22 @@ def read_range(world: World) -> NDArray[np.float64]:
     if world.traffic.count and distances[0] >= 0.0:
         now = world.state
         poses = world.traffic.poses()
-        shorten_at_boxes(
-            distances,
-            now.x,
-            now.y,
-            now.yaw,
-            BEAM_ANGLES,
-            poses,
-            TRAFFIC_CAR_SIZE[0],
-            TRAFFIC_CAR_SIZE[1],
-        )
+        poses = poses[~_on_other_level(world, poses)]
+        length, width, _ = TRAFFIC_CAR_SIZE
+        shorten_at_boxes(distances, now.x, now.y, now.yaw, BEAM_ANGLES, poses, length, width)
     return distances
+
+
+def _on_other_level(world: World, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the cars at `poses` (n, 6), m, rad, that are on a bridge over the
+    road of the world's car, or on the road below its bridge."""
+    track, s = world.road.track, world.state.s
+    other = np.abs(poses[:, 2] - track.at(s).z) > BRIDGE_M
+    for k in np.flatnonzero(other):
+        x, y, z = poses[k, :3]
+        at, offset = track.project(x, y, s)
+        other[k] = abs(z - float(track.at(at, offset).z)) > BRIDGE_M
+    return np.asarray(other)
 
 
 def range_meter(name: str, read: Callable[[World], NDArray[np.float64]]) -> Sensor:

@@ -1,6 +1,7 @@
 """Sensors: range beams against brute force and closed forms, units, noise, custom sensors."""
 
 import math
+from unittest import mock
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +18,7 @@ from simulator.track.road import Road
 from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.world.world import Command, World
 from tests.simulator.oracles import BruteForce
+from tests.simulator.track.track_samples import figure_of_eight
 from trackfeatures.camera import CameraParameters
 from trackfeatures.errors import UserError
 
@@ -108,6 +110,17 @@ def test_only_range_traffic_detects_traffic() -> None:
         assert ahead > 0.0
         assert read_range(world)[9] == pytest.approx(ahead, abs=0.5)
         assert read_track_range(world)[9] > ahead + 1.0
+
+
+def test_a_car_on_a_bridge_is_on_another_level() -> None:
+    """The figure of eight crosses itself at (0, 0); its upper road is 6 m higher."""
+    with World(Road(figure_of_eight()), traffic=1) as world:
+        world.reset(seed=0, s=world.road.track.length_m - 30.0, to_middle=0.0)
+        free = read_track_range(world)[9]
+        for height, expected in ((0.0, 30.0 - TRAFFIC_CAR_SIZE[0] / 2), (6.0, free)):
+            pose = np.array([[0.0, 0.0, height, 0.0, 0.0, 0.0]])
+            with mock.patch.object(type(world.traffic), "poses", return_value=pose):
+                assert read_range(world)[9] == pytest.approx(expected, abs=0.01)
 
 
 def test_readings_have_the_papers_units() -> None:
