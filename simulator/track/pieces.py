@@ -18,6 +18,7 @@ MAX_GAP_M: Final = 0.28
 """Largest gap between the last piece and the first. Of the 38 tracks of TORCS 1.3.7 all but two
 close within 0.09 m; forza has a gap of 0.152 m, wheel-2 of 0.262 m. TORCS accepts both."""
 MAX_HEADING_GAP: Final = math.radians(0.5)
+ADVICE: Final = "a track must be one closed loop, so correct its last segments"
 
 
 @dataclass(frozen=True)
@@ -130,15 +131,19 @@ def check_closes(placed: Placed, what: str, max_gap_m: float = MAX_GAP_M) -> Non
     height = max(
         abs(placed.z_left1[-1] - placed.z_left0[0]), abs(placed.z_right1[-1] - placed.z_right0[0])
     )
-    turn = heading - float(placed.heading0[0])
-    advice = "a track must be one closed loop, so correct its last segments"
     # The comparisons are negated, so that NaN raises as well.
     if not gap <= max_gap_m:
-        raise TrackError(f"{what}: the segments end {gap:.2f} m from their start; {advice}")
-    if not abs(math.remainder(turn, 2.0 * math.pi)) <= MAX_HEADING_GAP:
-        degrees = math.degrees(turn)
-        raise TrackError(f"{what}: the segments turn by {degrees:.2f} deg in all; {advice}")
+        raise TrackError(f"{what}: the segments end {gap:.2f} m from their start; {ADVICE}")
+    check_turn(heading - float(placed.heading0[0]), what)
     if not height <= max_gap_m:
         raise TrackError(
-            f"{what}: the segments end {height:.2f} m above or below their start; {advice}"
+            f"{what}: the segments end {height:.2f} m above or below their start; {ADVICE}"
         )
+
+
+def check_turn(turn: float, what: str) -> None:
+    """Raises TrackError unless `turn` (rad), by which all segments together turn, is within 0.5 deg
+    of a multiple of 360 deg. `what` names the track in the message."""
+    if not abs(math.remainder(turn, 2.0 * math.pi)) <= MAX_HEADING_GAP:
+        degrees = math.degrees(turn)
+        raise TrackError(f"{what}: the segments turn by {degrees:.2f} deg in all; {ADVICE}")

@@ -10,8 +10,9 @@
                  the same on every machine; "geometry" (default): from the pieces computed from
                  these numbers
 
-The bends must turn by +-360 degrees in total. Straights are adjusted by up to a metre so that the
-loop closes exactly. The mean grade is subtracted so that the heights close too.
+The bends must turn by +-360 degrees in total, or by 0 on a figure of eight. Straights are adjusted
+by up to a metre so that the loop closes exactly. The mean grade is subtracted so that the heights
+close too.
 """
 
 import hashlib
@@ -28,7 +29,7 @@ from simulator.track.errors import TrackError
 from simulator.track.geometry import Surface, Track, readable_name
 from simulator.track.layout import Bend, Segment, Straight, close, lay, segment_length
 from simulator.track.markings import LineColour, MarkingStyle
-from simulator.track.pieces import assemble, check_closes
+from simulator.track.pieces import assemble, check_closes, check_turn
 
 MAX_BYTES: Final = 2**20
 MAX_CORRECTION_M: Final = 1.0
@@ -138,6 +139,7 @@ def _hash(written: list[Segment], width: float, vertical_curve: float) -> str:
 def _closed(written: list[Segment], where: str) -> list[Segment]:
     """Close the loop of the segments `written` in the file. Raises TrackError, which contains
     `where`, if this changes a straight too much."""
+    check_turn(sum(s.angle for s in written if isinstance(s, Bend)), where)
     try:
         segments, correction = close(written)
     except TrackError as error:

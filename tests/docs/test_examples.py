@@ -12,6 +12,7 @@ import pytest
 
 from docs.generate import on_page_markdown
 from simulator.env import OPTIONS
+from simulator.track.catalogue import read_track
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -128,6 +129,16 @@ def test_the_tutorial_runs(tmp_path: Path) -> None:
         for words in commands(block.replace(" --minutes 1", "")):
             run(words, tmp_path)
     assert (tmp_path / "tutorial" / "report.html").is_file()
+
+
+def test_the_road_of_the_page_on_own_roads_can_be_driven(tmp_path: Path) -> None:
+    (text,) = blocks(ROOT / "docs/how-to/own-roads.md", "toml")
+    path = tmp_path / "figure-of-eight.toml"
+    path.write_text(text)
+    track = read_track(path)
+    lower, upper = track.at(0.0), track.at(track.length_m / 2)
+    assert (float(upper.x), float(upper.y)) == pytest.approx((lower.x, lower.y), abs=2.0)
+    assert float(upper.z - lower.z) > 3.0  # a bridge
 
 
 def test_every_link_of_the_readme_leads_to_a_file() -> None:

@@ -98,6 +98,7 @@ def test_heading_classes_are_balanced_over_all_tracks() -> None:
     ("old", "new", "said"),
     [
         ("radius = 130.0", "radius = 230.0", "to close the loop"),
+        ("angle = 90.0", "angle = 88.0", "the segments turn by 358.00 deg in all"),
         ("radius = 130.0", "radius = 2", "expected a number from 8"),
         ("radius = 130.0", 'radius = "wide"', "'wide'"),
         ("radius = 130.0", "radius = nan", "nan"),
