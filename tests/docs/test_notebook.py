@@ -20,6 +20,7 @@ SMALL = {
 
 
 @pytest.mark.slow
+@pytest.mark.extended
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JUPYTER_DATA_DIR", str(tmp_path / "jupyter"))
     # Sockets in a folder: a TCP port that is free when it is chosen may be taken when the kernel

@@ -108,7 +108,12 @@ def test_the_openvino_graph_matches_torch(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "steps"), [("mobilenet_v3_small", 12), ("deepdriving", 12), ("grid", 40)]
+    ("name", "steps"),
+    [
+        ("mobilenet_v3_small", 12),
+        pytest.param("deepdriving", 12, marks=pytest.mark.extended),
+        ("grid", 40),
+    ],
 )
 def test_other_networks_overfit_a_batch(dataset: Path, name: str, steps: int) -> None:
     architecture = thin(name)

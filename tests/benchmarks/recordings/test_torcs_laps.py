@@ -25,7 +25,11 @@ recorded = pytest.mark.skipif(
 
 @recorded
 @pytest.mark.slow
-@pytest.mark.parametrize("as_recorded", [True, False], ids=["as-recorded", "every-50-ms"])
+@pytest.mark.parametrize(
+    "as_recorded",
+    [pytest.param(True, marks=pytest.mark.extended), False],
+    ids=["as-recorded", "every-50-ms"],
+)
 @pytest.mark.parametrize("track", TRACKS)
 def test_the_flying_lap_equals_that_of_torcs_within_the_limits(
     track: str, as_recorded: bool

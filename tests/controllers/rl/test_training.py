@@ -128,7 +128,15 @@ def test_40_updates_give_the_numbers_of_before(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("state", ["paper", "stacked", "residual", "history"])
+@pytest.mark.parametrize(
+    "state",
+    [
+        "paper",
+        pytest.param("stacked", marks=pytest.mark.extended),
+        "residual",
+        pytest.param("history", marks=pytest.mark.extended),
+    ],
+)
 def test_a_stopped_training_resumes_to_the_same_bits(tmp_path: Path, state: str) -> None:
     whole = train(short(tmp_path / "whole", state=state))
 

@@ -53,7 +53,12 @@ def actor_of(run: Path) -> tuple[bytes, bytes]:
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "state"), [("ppo", "paper"), ("ppo", "history"), ("td3", "paper")]
+    ("algorithm", "state"),
+    [
+        ("ppo", "paper"),
+        pytest.param("ppo", "history", marks=pytest.mark.extended),
+        ("td3", "paper"),
+    ],
 )
 def test_a_stopped_training_resumes_to_the_same_bits(
     tmp_path: Path, algorithm: str, state: str

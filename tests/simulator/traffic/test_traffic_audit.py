@@ -19,7 +19,11 @@ from tests.simulator.traffic_audit import (
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("track", "lanes", "parked"),
-    [("town", 1, False), ("circuit", 2, False), ("oval", 3, True)],
+    [
+        pytest.param("town", 1, False, marks=pytest.mark.extended),
+        ("circuit", 2, False),
+        ("oval", 3, True),
+    ],
 )
 def test_ten_minutes_of_traffic_without_a_violation(track: str, lanes: int, parked: bool) -> None:
     seen = audit_traffic(Road(find_track(track), lanes), 600.0, parked=parked)
