@@ -21,13 +21,12 @@ from simulator.sensors.beams import (
 )
 from simulator.sensors.sensor import Sensor
 from simulator.track.piece_table import index_at
+from simulator.track.road import BRIDGE_M
 from simulator.traffic.traffic import TRAFFIC_CAR_SIZE
 from simulator.world.world import World
 from trackfeatures.errors import UserError
 
 KMH = 3.6  # km/h per m/s
-BRIDGE_M = 3.0
-"""Least height (m) of a road above another part of it that it crosses on a bridge."""
 CAMERA = "camera"
 """Name of the camera sensor, the only sensor that needs a `simulator.camera.Camera`."""
 

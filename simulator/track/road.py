@@ -17,6 +17,8 @@ SHOULDER_M = 1.0
 WALL_MARGIN_M = 2.5
 """Distance from the edge to the rails and walls. It exceeds half of a car's diagonal (2.46 m), so
 that a car has left the track before any part of it touches a wall."""
+BRIDGE_M = 3.0
+"""A road is a bridge where it crosses a part of itself that is more than this (m) lower."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from simulator.arrays import FloatArray
 from simulator.camera.core.mesh import Surface
 from simulator.camera.scene.strips import LEVELS, Level, strip
 from simulator.camera.scene.terrain import CentreLineSamples, Survey, Terrain
-from simulator.track.road import Road
+from simulator.track.road import BRIDGE_M, Road
 
 LAYOUT = ("3f 2f 3f 1f", "at", "road", "facing", "kerbed")
 """Layout of a vertex: x, y, z, s, lateral offset, normal (3), kerb (0 to 1)."""
@@ -26,10 +26,10 @@ TWIST_M = 0.004
 """Largest deviation (m) of two triangles from the twisted road plane between two rows."""
 SKIRT_M = 10.0
 """Largest width of a skirt, the part of the mesh between wall line and terrain."""
-DECK_M, HEADROOM_M, CLEAR_M = 1.0, 3.0, 1.5
-"""Where the road crosses a part of itself that is more than HEADROOM_M lower, it is a bridge: the
-skirt ends DECK_M below the wall line. This part of the skirt is over the asphalt of the lower road
-and over CLEAR_M beside it. All in m."""
+DECK_M, CLEAR_M = 1.0, 1.5
+"""Where the road is a bridge over a lower part of itself, the skirt ends DECK_M below the wall
+line. This part of the skirt is over the asphalt of the lower road and over CLEAR_M beside it. Both
+in m."""
 KERB_CURVATURE = 1.0 / 220.0
 SKIRT_WEIGHT, KERB_WEIGHT = 0.05, 0.3
 """Weights of geometric errors on the skirt and the kerb, relative to errors on the road."""
@@ -152,7 +152,7 @@ def _over_road(
     the points, `height` (R,), m, the height of the wall line in these rows."""
     near, sample = line.tree.query(at)
     under = near < np.minimum(np.abs(offset) - 1.0, road.half_asphalt + CLEAR_M)
-    under[under] = road.track.at(line.s[sample[under]]).z < height[under] - HEADROOM_M
+    under[under] = road.track.at(line.s[sample[under]]).z < height[under] - BRIDGE_M
     return np.asarray(under | np.roll(under, 1) | np.roll(under, -1))
 
 
